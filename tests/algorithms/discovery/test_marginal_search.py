@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
-from lsst.fringe_sim.algorithms.discovery.marginal.preparation import prepare
+from lsst.fringe_sim.algorithms.discovery.marginal.preparation import Prepared, prepare
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
 from lsst.fringe_sim.effects import known_effects
 from lsst.fringe_sim.errors import UnknownNameError
@@ -20,13 +20,19 @@ SIDE = 32
 ELECTRONS = 20_000.0
 
 
-def cube_of(rng: np.random.Generator, effects: dict[str, float]) -> FringeCube:
-    """Flats of a small sensor with photon noise; the optics are the package's own."""
-    y, x = np.mgrid[:SIDE, :SIDE] / SIDE
+def cube_of(
+    rng: np.random.Generator, effects: dict[str, float], side: int = SIDE, places: int = 1
+) -> FringeCube:
+    """Flats of a small sensor with photon noise; the optics are the package's own.
+
+    Pixels see so many by so many places of their area.
+    """
+    y, x = (np.mgrid[: side * places, : side * places] + 0.5 - 0.5 * places) / (SIDE * places)
     thickness = 15.0 + 0.5 * x + 0.3 * y**2 - 0.2 * x * y
     model = FringeModel.from_setup("ts8_e2v", effects)
     light = model.system.flat_fields(WAVELENGTHS, 0.1)
     flats = model.respond(light, thickness, WAVELENGTHS)
+    flats = flats.reshape(8, side, places, side, places).mean(axis=(2, 4))
     flats *= ELECTRONS / flats.mean(axis=(1, 2), keepdims=True)
     image = rng.poisson(flats).astype(np.float32)
     setup = model.setup
@@ -88,6 +94,35 @@ def test_selection_does_not_see_the_part_held_out(rng: np.random.Generator) -> N
     second = prepared(replace(cube, image=planted.astype(np.float32)))
     assert np.array_equal(first.null.point.thickness_um, second.null.point.thickness_um)
     assert first.null.log_evidence == second.null.log_evidence
+
+
+@pytest.mark.rng("weak fringes")
+def test_cells_suit_a_contrast_that_is_not_known(rng: np.random.Generator) -> None:
+    model = FringeModel.from_setup("ts8_e2v")
+    effects = [effect for effect in known_effects(None) if not effect.sky_only]
+
+    def prepared(contrast: float) -> Prepared:
+        cube = cube_of(rng, {"contrast_loss.factor": contrast}, 64)
+        return prepare(cube, model, effects, 20_000, Rules(), np.random.default_rng(5))
+
+    plain, weak = prepared(1.0), prepared(0.1)
+    assert plain.cells.cell_px == 1
+    assert weak.cells.cell_px > 1
+    for own, contrast in ((plain, 1.0), (weak, 0.1)):
+        assert own.free.problem.forward.contrast == pytest.approx(contrast, rel=0.05)
+        assert own.noise_factor == pytest.approx(1.0, abs=0.1)
+        assert own.problem.forward.contrast == 1.0  # what is searched believes the model
+
+
+@pytest.mark.rng("pixels")
+@pytest.mark.parametrize("places", [1, 3])
+def test_pixels_see_a_point_or_their_area_by_the_likelihood(places: int, rng: np.random.Generator) -> None:
+    cube = cube_of(rng, {"contrast_loss.factor": 0.8}, 64, places)
+    effects = [effect for effect in known_effects(None) if not effect.sky_only]
+    model = FringeModel.from_setup("ts8_e2v")
+    found = prepare(cube, model, effects, 20_000, Rules(), np.random.default_rng(5))
+    assert found.problem.forward.shape.area == (places > 1)
+    assert found.free.problem.forward.contrast == pytest.approx(0.8, abs=0.01)
 
 
 def test_another_core_is_refused() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -16,8 +18,10 @@ from lsst.fringe_sim.algorithms.inference import (
     effect_columns,
     fit,
     in_best_orders,
+    in_whole_orders,
     jumped,
     relaxed,
+    with_free_contrast,
 )
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.model import FringeModel
@@ -223,3 +227,58 @@ def test_cells_find_the_best_of_an_order() -> None:
     only = in_best_orders(point, some).thickness_um
     assert np.abs(only - thickness)[some].max() < 1e-4
     assert np.array_equal(only[~some], point.thickness_um[~some])
+
+
+@pytest.mark.rng("contrast that is free")
+def test_contrast_is_found_with_the_thickness(rng: np.random.Generator) -> None:
+    forward, thickness = forward_of()
+    value = replace(forward, contrast=0.2).predict({}, thickness)[0]
+    data = Data(value + 1e-3 * rng.standard_normal(value.shape), np.full(value.shape, 1e-3**-2.0))
+    first = thickness + 0.01 * rng.standard_normal(thickness.size)
+    problem = Problem(data, forward, first, 1e-5)
+    free = with_free_contrast(problem.at({}, np.ones(len(WAVELENGTHS)), first))
+    plain = relaxed(problem.at({}, np.ones(len(WAVELENGTHS)), first), rounds=12)
+    assert free.problem.forward.contrast == pytest.approx(0.2, rel=0.02)
+    assert np.abs(free.thickness_um - thickness).std() < 0.004
+    # With the contrast of the model the thickness goes to where the model has the weakest fringes.
+    assert np.abs(plain.thickness_um - thickness).std() > 0.02
+
+
+@pytest.mark.rng("cells that go back")
+def test_cells_return_to_the_first_thickness(rng: np.random.Generator) -> None:
+    forward, thickness = forward_of()
+    value = forward.predict({}, thickness)[0]
+    problem = Problem(Data(value, np.full(value.shape, 2e-3**-2.0)), forward, thickness, 1e-5)
+    lost = thickness + forward.order_um * (rng.random(thickness.size) < 0.2)
+    found = fit((), (), problem.at({}, np.ones(len(WAVELENGTHS)), lost))
+    assert np.abs(found.point.thickness_um - thickness).max() < 1e-3
+
+
+@pytest.mark.rng("a rough field")
+@pytest.mark.parametrize("stated", [0.004, 0.008, 0.012, 0.03])
+def test_slopes_of_a_rough_field_do_not_swing(stated: float, rng: np.random.Generator) -> None:
+    y, x = np.mgrid[:32, :32] * 2.0
+    smooth = 17.0 + 0.03 * x - 0.02 * y + 0.3 * np.cos(0.08 * x + 0.05 * y)
+    rough = smooth + 0.012 * rng.standard_normal(smooth.shape)
+    shape, exact = CellShape.of_field(rough, 2, stated), CellShape.of_field(smooth, 2)
+    # The straight difference of two neighbours errs by 0.0085.
+    assert (shape.gradient - exact.gradient).std() < 0.0085
+    assert np.abs(shape.gradient).max() < 0.12
+
+
+@pytest.mark.rng("whole orders")
+@pytest.mark.parametrize("turns", ["none", "all", "parts"])
+def test_all_and_parts_of_a_sensor_are_moved_by_whole_orders(turns: str, rng: np.random.Generator) -> None:
+    forward, thickness = forward_of(side=24, part=0.5)
+    value = forward.predict({}, thickness)[0]
+    data = Data(value + 3e-3 * rng.standard_normal(value.shape), np.full(value.shape, 3e-3**-2.0))
+    y, x = np.mgrid[:24, :24]
+    parts = np.where((y < 7) & (x < 9), -1.0, 0.0)
+    parts[12, 12] = 1.0
+    wrong = {"none": np.zeros((24, 24)), "all": np.ones((24, 24)), "parts": parts}[turns].ravel()
+    start = thickness + wrong * forward.order_um
+    point = relaxed(Problem(data, forward, thickness, 1e-5).at({}, np.ones(len(WAVELENGTHS)), start))
+    found = relaxed(in_whole_orders(point, 5.0))
+    # Of single cells not all are sure.
+    assert (np.abs(found.thickness_um - thickness) > 0.02).mean() < (0.005 if turns == "parts" else 1e-9)
+    assert (found.cost < point.cost - 100.0) == (turns != "none")

@@ -206,7 +206,7 @@ def _follow(template: FloatArray, cells: CellData, order: float) -> tuple[NDArra
     score = _correlate(template, cells)
     count = template.shape[1]
     best = _grow(score, cells.shape[1], cells.shape[2], int(HALF_WINDOW_UM / SEARCH_STEP_UM))
-    found = [best + _common_shift(score, best, order, count)]
+    found = [np.clip(best + _common_shift(score, best, order, count), 0, count - 1)]
     if min(cells.shape[1:]) >= FEWEST_ROWS:
         found.append(_each_alone(score, cells, order))
     places = np.arange(len(best))

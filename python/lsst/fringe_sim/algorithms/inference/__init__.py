@@ -4,7 +4,16 @@ from .cell_average import CellShape
 from .coordinates import Coordinate, coordinates_of
 from .forward import Forward
 from .marginal import Columns, Data, Point, Problem, joined
-from .optimise import Hypothesis, effect_columns, fit, in_best_orders, jumped, relaxed
+from .optimise import (
+    Hypothesis,
+    effect_columns,
+    fit,
+    in_best_orders,
+    in_whole_orders,
+    jumped,
+    relaxed,
+    with_free_contrast,
+)
 
 __all__ = [
     "CellShape",
@@ -19,7 +28,9 @@ __all__ = [
     "effect_columns",
     "fit",
     "in_best_orders",
+    "in_whole_orders",
     "joined",
     "jumped",
     "relaxed",
+    "with_free_contrast",
 ]

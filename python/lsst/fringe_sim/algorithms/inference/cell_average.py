@@ -21,6 +21,9 @@ FloatArray = NDArray[np.float64]
 LEAST_SPREAD_UM2 = 1e-14
 """Variance of the thickness in a cell that is rounding [µm²]."""
 
+STIFFNESSES, BISECTIONS = (1e-4, 1e10), 30
+"""Least and largest weight of third differences, and how often the range is halved."""
+
 BLURRED_PLACES = 7
 """Places that stand for a blur: a Gaussian of 2 rad rms of fringe phase is right to 1e-3."""
 
@@ -58,7 +61,7 @@ class CellShape:
         if min(thickness_um.shape) < 4:
             empty = np.zeros((3, thickness_um.size))
             return cls(empty[:2], empty, cell_px, area, edge)
-        spline = RectBivariateSpline(rows, columns, thickness_um, s=error_um**2 * thickness_um.size)
+        spline = RectBivariateSpline(rows, columns, _smoothed(thickness_um, error_um))
 
         def derivative(dy: int, dx: int) -> FloatArray:
             return np.asarray(spline(rows, columns, dx=dy, dy=dx)).ravel()
@@ -133,6 +136,31 @@ class CellShape:
         reach = np.abs(self.edge_px) / blur_px
         mean = math.sqrt(2.0 / math.pi) * np.exp(-0.5 * reach**2) + reach * erf(reach / math.sqrt(2.0))
         return blur_px * np.sign(self.edge_px) * (mean - reach), blur_px**2 * (reach**2 + 1.0 - mean**2)
+
+
+def _smoothed(field: FloatArray, error: float) -> FloatArray:
+    """The field ``(ny, nx)`` of least squared third differences that departs from another by an error rms.
+
+    The stiffness is found by bisection: both axes have the eigenvectors of their differences for modes, of which each
+    is made smaller by a factor of its own. (A spline of few knots with that departure, as FITPACK has it, may swing
+    by orders between its knots.)
+    """
+    (rows, down), (columns, along) = (_modes(size) for size in field.shape)
+    modes, bends = down.T @ field @ along, rows[:, np.newaxis] + columns
+    low, high = STIFFNESSES
+    for _ in range(BISECTIONS if error > 0.0 else 0):
+        middle = math.sqrt(low * high)
+        left = modes * (1.0 - 1.0 / (1.0 + middle * bends))
+        low, high = (middle, high) if (left**2).mean() < error**2 else (low, middle)
+    return np.asarray(down @ (modes / (1.0 + low * bends)) @ along.T) if error > 0.0 else field
+
+
+def _modes(size: int) -> tuple[FloatArray, FloatArray]:
+    """Squared third differences of the modes of an axis, and the modes, which are of unit length."""
+    differences = np.diff(np.eye(size), 3, axis=0)
+    bends, modes = np.linalg.eigh(differences.T @ differences)
+    bends[:3] = 0.0  # parabolas have none
+    return bends, modes
 
 
 def look_up(

@@ -56,6 +56,8 @@ class Forward:
         Thicknesses of the tables [µm]; the light is relative to its tapered mean over them, whatever is asked.
     centroid : `numpy.ndarray`, shape ``(2, W, N)``, optional
         Where the good pixels of a cell have their mean, from its centre [px].
+    contrast : `float`
+        Contrast of the fringes over that of the model; 1 but while noise and cells are judged.
     """
 
     model: FringeModel
@@ -64,6 +66,7 @@ class Forward:
     shape: CellShape
     range_um: tuple[float, float]
     centroid: FloatArray | None = None
+    contrast: float = 1.0
     _tables: dict[_Key, FloatArray] = field(default_factory=dict, repr=False)
     _rows: dict[tuple[_Key, int, float], FloatArray] = field(default_factory=dict, repr=False)
     _by_name: dict[str, Effect] = field(default_factory=dict, repr=False)
@@ -95,6 +98,7 @@ class Forward:
         image = {key: value for key, value in everything.items() if self.effect_of(key).acts_on == "image"}
         optical = {key: value for key, value in everything.items() if key not in image}
         value, slope = self._light(optical, thickness_um, self._blur_px(image))
+        value, slope = 1.0 + self.contrast * (value - 1.0), self.contrast * slope
         image = {key: value for key, value in image.items() if not self._is_blur(self.effect_of(key))}
         if not any(
             not item.is_null(self.model.base_system) for item in activate_effects(image, self.catalogue)

@@ -146,6 +146,13 @@ class Point:
         away = (self.thickness_um - self.problem.thickness_um) / self.problem.thickness_sigma_um
         return np.asarray(own + 0.5 * away**2)
 
+    @property
+    def cell_evidence(self) -> FloatArray:
+        """Log likelihood of every cell with response and thickness integrated, but for constants, ``(N,)``."""
+        first, _, second = self._root
+        priors = self.problem.response_sigma * self.problem.thickness_sigma_um
+        return np.asarray(-self.cell_energy - np.log(first * second * priors))
+
     @cached_property
     def log_det(self) -> float:
         """Half of the log determinant of the cells over that of their priors."""

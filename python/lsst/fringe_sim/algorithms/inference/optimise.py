@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from ...errors import OutOfRangeError
 from .coordinates import SECANT, Coordinate, log_evidence_of_parameters
 from .marginal import Columns, Point, joined
 
-__all__ = ["Hypothesis", "effect_columns", "fit", "in_best_orders", "jumped", "relaxed"]
+__all__ = [
+    "Hypothesis",
+    "effect_columns",
+    "fit",
+    "in_best_orders",
+    "in_whole_orders",
+    "jumped",
+    "relaxed",
+    "with_free_contrast",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -23,6 +33,9 @@ MOST_STEP_UM = 0.05
 MOST_JUMP_UM = 0.25
 """The same of a finite change of an effect, whose thickness may have to follow by most of an order."""
 
+LEAST_LEFT = 0.3
+"""Part of the contrast that a step leaves at least."""
+
 STRIDE_UM, MOST_STRIDES = 0.05, 16
 """Typical length of a stride of the thickness [µm], and how many of them are walked at most."""
 
@@ -31,6 +44,12 @@ SHIFTS = (0.0, -1.0 / 3.0, 1.0 / 3.0)
 
 RIDGE_SCALES = 10.0
 """Prior scales of the Gaussian that keeps parameters which the data do not see where they are."""
+
+MOST_TURNS, PARTS = 2, (9, 5, 3, 1)
+"""Whole orders by which cells are moved, and sides of the parts of a sensor that are moved together [cells]."""
+
+LEAST_GAIN, LEAST_PART = 0.03, 0.01
+"""Gain of log likelihood, and part of what a fit lacks of another, with which steps end."""
 
 SHRINK = (1.0, 0.4, 0.12, 0.03)
 """Parts of a step that are tried."""
@@ -91,6 +110,36 @@ def relaxed(point: Point, rounds: int = 3, tolerance: float = 0.02) -> Point:
     return point
 
 
+def with_free_contrast(point: Point, rounds: int = 8, tolerance: float = 0.02) -> Point:
+    """Levels, thickness and the contrast of the fringes at the best for these effects.
+
+    The contrast is part of the model of the point that is returned. Where fringes are weaker than the model has them,
+    a thickness that is fitted with its contrast goes to where the model has the weakest ones.
+    """
+    for _ in range(rounds):
+        forward = point.problem.forward
+        fringes = point.whitened((point.value - 1.0) / forward.contrast)
+        own = point.columns(fringes[np.newaxis], point.steep[np.newaxis] / forward.contrast)
+        columns = joined(point.level_columns, own)
+        gradient = point.score(columns) - columns.log_det
+        step = np.linalg.solve(point.information(columns, columns), gradient)
+        moved = np.clip(point.followed_um(step, columns), -MOST_STEP_UM, MOST_STEP_UM)
+        for part in SHRINK:
+            contrast = max(forward.contrast + part * float(step[-1]), LEAST_LEFT * forward.contrast)
+            problem = replace(point.problem, forward=replace(forward, contrast=contrast))
+            new = problem.at(
+                point.settings, point.levels + part * step[:-1], point.thickness_um + part * moved
+            )
+            if new.cost < point.cost:
+                break
+        else:
+            return point
+        gain, point = point.cost - new.cost, new
+        if gain < tolerance:
+            break
+    return point
+
+
 def jumped(point: Point, items: Sequence[Coordinate], values: Sequence[float]) -> Point:
     """Another value of some parameters, with the thickness that goes with it, and relaxed.
 
@@ -124,10 +173,49 @@ def in_best_orders(point: Point, where: NDArray[np.bool_] | None = None, rounds:
     ``where`` (N,): cells that may move; the others stay.
     """
     order_um = point.problem.forward.order_um
+    return _in_best_minima(point, [point.thickness_um + shift * order_um for shift in SHIFTS], where, rounds)
+
+
+def in_whole_orders(point: Point, odds: float, rounds: int = 2) -> Point:
+    """All of the sensor, then parts of it, in the fringe orders in which the cells together are the likeliest.
+
+    A part is a cell with its neighbours, or alone if it is sure. ``odds``: logarithm of those for which a part is moved;
+    that it is one of so many parts which is in another order is the less likely, the more parts there are.
+    """
+    shape, order_um = point.problem.forward.geometry.sample_shape, point.problem.forward.order_um
+    turns = np.arange(-MOST_TURNS, MOST_TURNS + 1)
+    found = []
+    for turn in turns:
+        own = point.moved(point.levels, point.thickness_um + turn * order_um)
+        for _ in range(rounds if turn else 0):
+            step = np.clip(own.wanted_um, -MOST_STEP_UM, MOST_STEP_UM)
+            own = own.moved(own.levels, own.thickness_um + step)
+        found.append((own.cell_energy, own.thickness_um))
+    energy, thickness = (np.stack(part) for part in zip(*found, strict=True))
+    best = np.full(energy.shape[1], int(energy.sum(axis=1).argmin()))
+    cells = np.arange(len(best))
+    for side in PARTS:
+        around = np.stack(
+            [uniform_filter(one.reshape(shape), side, mode="constant").ravel() for one in energy]
+        )
+        likelier = around.argmin(axis=0)
+        gained = around[best, cells] - around[likelier, cells]
+        price = odds + math.log(max(len(best) / side**2, 1.0))
+        best = np.where(side**2 * gained > price, likelier, best)
+    return point if (turns[best] == 0).all() else point.moved(point.levels, thickness[best, cells])
+
+
+def _in_best_minima(
+    point: Point,
+    starts: Sequence[FloatArray],
+    where: NDArray[np.bool_] | None = None,
+    rounds: int = 4,
+) -> Point:
+    """The thickness of every cell at the best to which these lead, each ``(N,)`` [µm], or where it is."""
     moves = np.ones(len(point.thickness_um)) if where is None else where.astype(float)
     best, energy = point.thickness_um.copy(), point.cell_energy.copy()
-    for shift in SHIFTS:
-        own = point.moved(point.levels, point.thickness_um + shift * order_um * moves)
+    for start in starts:
+        own = point.moved(point.levels, point.thickness_um + (start - point.thickness_um) * moves)
         for number in range(rounds + 1):
             better = own.cell_energy < energy
             best[better], energy[better] = own.thickness_um[better], own.cell_energy[better]
@@ -148,25 +236,39 @@ def fit(
     start: Point,
     *,
     rounds: int = 12,
-    tolerance: float = 0.03,
+    aim: float = math.inf,
 ) -> Hypothesis:
-    """The best parameters, levels and thickness from a start, by steps that lower the cost."""
-    point = _started(items, start)
-    for number in range(rounds + 1):
+    """The best parameters, levels and thickness from a start, by steps that lower the cost.
+
+    Cells may go back to the first thickness: on the way from other effects some are left in other minima. ``aim``:
+    cost that others have reached; a fit that is far behind ends when its steps are short beside what it lacks.
+    """
+    point = _walked(items, _started(items, start), rounds, aim)
+    back = _in_best_minima(point, [point.problem.thickness_um])
+    if point.cost - back.cost > _tolerance(back, aim):
+        point = _walked(items, back, rounds, aim)
+    return _hypothesis(effects, items, point)
+
+
+def _tolerance(point: Point, aim: float) -> float:
+    """Gain of a step with which a fit ends."""
+    return max(LEAST_GAIN, LEAST_PART * (point.cost - aim))
+
+
+def _walked(items: Sequence[Coordinate], point: Point, rounds: int, aim: float) -> Point:
+    """The same without going back."""
+    for _ in range(rounds):
         columns = point.level_columns
         if items:
             columns = joined(columns, effect_columns(point, items))
-        information = point.information(columns, columns)
-        if number == rounds:
-            break
-        step = _step(point, items, columns, information)
+        step = _step(point, items, columns, point.information(columns, columns))
         new = _best_of_parts(point, items, step, point.followed_um(step, columns))
         if new is None:
             break
         gain, point = _target(point, items) - _target(new, items), new
-        if gain < tolerance:
+        if gain < _tolerance(point, aim):
             break
-    return _hypothesis(effects, items, point)
+    return point
 
 
 def _started(items: Sequence[Coordinate], start: Point) -> Point:

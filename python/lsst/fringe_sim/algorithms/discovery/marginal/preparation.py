@@ -12,11 +12,21 @@ from ....effects import Effect
 from ....model import FringeModel
 from ....products.fringe_cube import FringeCube
 from ....products.mask import mask_bits
-from ...inference import CellShape, Data, Forward, Hypothesis, Point, Problem, fit, relaxed
+from ...inference import (
+    CellShape,
+    Data,
+    Forward,
+    Hypothesis,
+    Point,
+    Problem,
+    fit,
+    in_whole_orders,
+    with_free_contrast,
+)
 from ..cells import CellData, bin_cube, finest_useful_cell
 from ..continuation import continued
 from ..outliers import spoiled_cells
-from ..start import starting_thickness
+from ..start import robust_surface, starting_thickness
 from ..validation import BLOCKS_ACROSS, FEWEST_ROWS
 from .noise import measured_noise, neighbour_scatter
 from .rules import Rules
@@ -32,6 +42,12 @@ MARGIN_UM = 0.8
 FIRST_ERROR_UM = 0.004
 """Error of the first thickness [µm]: it is one of steps of 0.01."""
 
+SURFACE_CELLS = 8.0
+"""Distance of the knots of the surface whose slope limits the size of cells [cells]."""
+
+KNOWN_UM = 1e-6
+"""Error of a thickness that is known [µm]."""
+
 NO_SCATTER, FIRST_SCATTER = 1e-6, 0.003
 """Response scatter that is none, and what it is before it is measured (the prototype's)."""
 
@@ -45,6 +61,7 @@ class Prepared:
     problem: Problem
     null: Hypothesis
     noise_factor: FloatArray  # (W,): measured over stated standard deviation
+    free: Point  # the unchanged model with the contrast of the data
 
     @property
     def point(self) -> Point:
@@ -66,16 +83,54 @@ def prepare(
     """
     held = _held_out(cube.shape[1:], rules.heldout_fraction, rng)
     size = finest_useful_cell(_masked(cube, held), most_cells=most_cells)
-    prepared = _in_cells(cube, held, size, model, effects)
-    while min(prepared.cells.shape[1:]) >= 2 * FEWEST_ROWS:
-        turn = 2.0 * np.pi / prepared.problem.forward.order_um
-        error = turn * _thickness_error_um(prepared.point)
-        slope = turn * np.quantile(np.hypot(*prepared.problem.forward.shape.gradient), 0.95)
-        if error < rules.phase_error or 2.0 * size * slope > rules.cell_phase:
-            break
+    prepared = _in_cells(cube, held, size, model, effects, rules)
+    turn = 2.0 * np.pi / prepared.problem.forward.order_um
+    # Smaller ones than are needed may be in wrong orders, and tell nothing of larger ones.
+    while turn * _thickness_error_um(prepared.free) > rules.phase_error:
         size *= 2
-        prepared = _in_cells(cube, held, size, model, effects)
+        if min(cube.shape[1:]) // size < FEWEST_ROWS:
+            break
+        larger = _in_cells(cube, held, size, model, effects, rules)
+        across = turn * _steepest_um(larger) * size
+        if across < rules.cell_phase and _is_likelier(larger, prepared):
+            prepared = larger
     return prepared
+
+
+def _is_likelier(larger: Prepared, smaller: Prepared) -> bool:
+    """Whether values in small cells are likelier with the thickness of larger ones, which are made of them."""
+    coarse, fine = larger.free, smaller.free
+    thickness, shape, inside = _in_parts(larger, smaller)
+    forward = replace(fine.problem.forward, shape=shape)
+    known = replace(fine.problem, forward=forward, thickness_um=thickness, thickness_sigma_um=KNOWN_UM)
+    point = with_free_contrast(known.at({}, fine.levels, thickness))
+    used, seen = inside & fine.problem.data.seen, coarse.problem.data.seen
+    priors = np.log(coarse.thickness_sigma_um / coarse.problem.thickness_sigma_um)[seen]
+    gained = point.cell_evidence[used].sum() + priors.sum() - fine.cell_evidence[used].sum()
+    return bool(gained > 0.0)
+
+
+def _in_parts(larger: Prepared, smaller: Prepared) -> tuple[FloatArray, CellShape, BoolArray]:
+    """Thickness of larger cells in the smaller ones, its shape there, and which of those lie in one with data."""
+    own, size = larger.free.problem.forward.shape, smaller.cells.cell_px
+    parts = larger.cells.cell_px // size
+    rows, columns = larger.cells.shape[1:]
+    target = smaller.cells.shape[1:]
+    more = [(0, full - parts * part) for full, part in zip(target, (rows, columns), strict=True)]
+
+    def spread(values: FloatArray) -> FloatArray:
+        whole = np.kron(values.reshape(rows, columns), np.ones((parts, parts)))
+        return np.pad(whole, more, mode="edge").ravel()
+
+    y, x = (size * (place % parts - 0.5 * (parts - 1)).ravel() for place in np.indices(target))
+    down, along = (spread(part) for part in own.gradient)
+    yy, yx, xx = hessian = np.stack([spread(part) for part in own.hessian])
+    thickness = spread(larger.free.thickness_um) + down * y + along * x
+    thickness += 0.5 * (yy * y**2 + 2.0 * yx * y * x + xx * x**2)
+    gradient = np.stack([down + yy * y + yx * x, along + yx * y + xx * x])
+    inside = spread(larger.cells.seen.astype(float)) > 0.0
+    inside &= np.pad(np.ones((parts * rows, parts * columns), dtype=bool), more).ravel()
+    return thickness, CellShape(gradient, hessian, size, own.area), inside
 
 
 def _held_out(shape: tuple[int, ...], fraction: float, rng: np.random.Generator) -> BoolArray:
@@ -94,7 +149,7 @@ def _masked(cube: FringeCube, out: BoolArray) -> FringeCube:
 
 
 def _in_cells(
-    cube: FringeCube, held: BoolArray, size: int, model: FringeModel, effects: Sequence[Effect]
+    cube: FringeCube, held: BoolArray, size: int, model: FringeModel, effects: Sequence[Effect], rules: Rules
 ) -> Prepared:
     """The same in cells of so many pixels."""
     cells = bin_cube(_masked(cube, held), size)
@@ -103,28 +158,65 @@ def _in_cells(
     )
     first = continued(starting_thickness(model, cells), cells.seen)
     problem = _problem(cells, model, effects, first)
-    point = relaxed(problem.at({}, np.ones(cells.shape[0]), problem.thickness_um), rounds=8)
+    # The first thickness does not believe in the contrast of the model; it stays until that of the data is known.
+    known = replace(problem, thickness_sigma_um=KNOWN_UM)
+    point = with_free_contrast(known.at({}, np.ones(cells.shape[0]), problem.thickness_um))
+    problem = replace(problem, forward=point.problem.forward)
+    point = with_free_contrast(problem.at({}, point.levels, problem.thickness_um))
+    point = in_whole_orders(point, rules.class_width)
     factor = np.ones(cells.shape[0])
     for _ in range(2):
         spoiled = spoiled_cells(_left(point, cells), cells.weight > 0.0)
         cells, noise, problem = _judged(cells.restricted(~spoiled), point)
         factor = factor * noise
-        point = relaxed(problem.at({}, point.levels, problem.thickness_um), rounds=4)
+        point = with_free_contrast(problem.at({}, point.levels, problem.thickness_um), rounds=4)
+        point = _with_likelier_pixels(point, rules)
     unseen = unseen.scaled_noise(factor, cells.response_scatter)
-    return Prepared(cells, unseen, problem, fit((), (), point), factor)
+    problem = _as_modelled(point.problem)
+    null = fit((), (), problem.at({}, point.levels, point.thickness_um), aim=point.cost)
+    return Prepared(cells, unseen, problem, null, factor, point)
 
 
-def prepare_again(prepared: Prepared, found: Hypothesis) -> Prepared:
-    """Noise, and what the thickness does within cells, as judged with effects in the model."""
-    cells, noise, problem = _judged(prepared.cells, found.point)
+def _with_likelier_pixels(point: Point, rules: Rules) -> Point:
+    """The same where pixels see the point in their middle instead of all of their area, or the reverse, if likelier."""
+    forward = point.problem.forward
+    shape = replace(forward.shape, area=not forward.shape.area)
+    problem = replace(point.problem, forward=replace(forward, shape=shape))
+    other = with_free_contrast(problem.at(point.settings, point.levels, point.thickness_um), rounds=4)
+    return other if point.cost - other.cost > rules.class_width else point
+
+
+def _as_modelled(problem: Problem) -> Problem:
+    """A problem with the contrast of the model."""
+    return replace(problem, forward=replace(problem.forward, contrast=1.0))
+
+
+def _steepest_um(prepared: Prepared) -> float:
+    """Change of the thickness where it is steep but for a twentieth of the cells [µm/px].
+
+    Of the surface through most cells, as some may lie in other orders.
+    """
+    cells, problem = prepared.cells, prepared.problem
+    field = problem.thickness_um.reshape(cells.shape[1:])
+    surface = robust_surface(field, cells.seen, SURFACE_CELLS, problem.forward.order_um)
+    return float(np.quantile(np.hypot(*np.gradient(surface, cells.cell_px)), 0.95))
+
+
+def prepare_again(prepared: Prepared, found: Hypothesis, rules: Rules) -> Prepared:
+    """Noise, and what pixels see and the thickness does within cells, as judged with effects in the model."""
+    point = _with_likelier_pixels(with_free_contrast(found.point), rules)
+    cells, noise, problem = _judged(prepared.cells, point)
+    # Every fit may return to the first thickness, whatever has been fitted since.
+    problem = replace(_as_modelled(problem), thickness_um=prepared.problem.thickness_um)
     null = problem.at({}, prepared.point.levels, prepared.point.thickness_um)
     return replace(
         prepared,
         cells=cells,
         unseen=prepared.unseen.scaled_noise(noise, cells.response_scatter),
         problem=problem,
-        null=fit((), (), relaxed(null, rounds=4)),
+        null=fit((), (), null, aim=point.cost),
         noise_factor=prepared.noise_factor * noise,
+        free=point,
     )
 
 
@@ -143,7 +235,8 @@ def _judged(cells: CellData, point: Point) -> tuple[CellData, FloatArray, Proble
     # A wrong model errs in the thickness by more than noise does, and slopes that follow the errors blur fringes.
     error = max(_thickness_error_um(point), neighbour_scatter(thickness, cells.seen, 0.0))
     # Tables stay; they reach farther than the thickness moves.
-    forward = replace(old, shape=CellShape.of_field(thickness, cells.cell_px, error), geometry=geometry)
+    shape = CellShape.of_field(thickness, cells.cell_px, error, area=old.shape.area)
+    forward = replace(old, shape=shape, geometry=geometry)
     problem = replace(
         point.problem,
         data=_data(cells),

@@ -18,6 +18,7 @@ from ...inference import (
     coordinates_of,
     effect_columns,
     fit,
+    in_whole_orders,
     joined,
     jumped,
 )
@@ -100,7 +101,7 @@ class SetSearch:
             return best
         for parent in beam[1:]:
             self._grow(parent, most=self.rules.refits // 2)
-        grown = self._of_size(size)
+        grown = self._in_orders(size)
         if not grown:
             return best
         top = self._settled(grown[0]) if size > 1 else grown[0]
@@ -127,7 +128,7 @@ class SetSearch:
             behind = self.posterior(best) - self.posterior(one)
             if one is not best and behind < self.rules.refits * self.rules.class_width:
                 at = one.point.moved(one.point.levels, best.point.thickness_um)
-                self._keep(fit(one.effects, one.items, at))
+                self._keep(self._fit(one.effects, one.items, at))
         return self._of_size(len(best.effects))[0]
 
     def best_so_far(self) -> Hypothesis:
@@ -155,7 +156,7 @@ class SetSearch:
             elif number < 2 * self.rules.refits:
                 at = one.point
                 start = null.point.problem.at(at.settings, at.levels, at.thickness_um)
-                again._keep(fit(one.effects, one.items, start))
+                again._keep(again._fit(one.effects, one.items, start))
                 again._added_before |= steps
         return again
 
@@ -173,6 +174,20 @@ class SetSearch:
         """All sets of so many effects, best first."""
         found = [one for one in self.pool.values() if len(one.effects) == size]
         return sorted(found, key=self.posterior, reverse=True)
+
+    def _in_orders(self, size: int) -> list[Hypothesis]:
+        """All sets of so many effects, the best of them in other fringe orders too where none leaves noise."""
+        grown = self._of_size(size)
+        if not grown or self.leaves_noise(grown[0]):
+            return grown
+        for found in grown[: self.rules.beam]:
+            point, order_um = found.point, found.point.problem.forward.order_um
+            starts = [in_whole_orders(point, self.rules.class_width)]
+            starts += [point.moved(point.levels, point.thickness_um + turn * order_um) for turn in (-1.0, 1.0)]
+            for start in starts:
+                if start is not point:
+                    self._keep(self._fit(found.effects, found.items, start))
+        return self._of_size(size)
 
     def _settled(self, found: Hypothesis) -> Hypothesis:
         """The best set after members were left out and exchanged, as long as that helps."""
@@ -197,12 +212,16 @@ class SetSearch:
         items = tuple(item for item in found.items if item.effect != name)
         own = {item.key: item.null for item in found.items if item.effect == name}
         start = jumped(found.point, [i for i in found.items if i.effect == name], list(own.values()))
-        return self._keep(fit(names, items, self._without_keys(start, set(own))))
+        return self._keep(self._fit(names, items, self._without_keys(start, set(own))))
 
     @staticmethod
     def _without_keys(point: Point, keys: set[str]) -> Point:
         settings = {key: value for key, value in point.settings.items() if key not in keys}
         return point.moved(point.levels, point.thickness_um, settings)
+
+    def _fit(self, names: Sequence[str], items: Sequence[Coordinate], start: Point) -> Hypothesis:
+        """A fit that is as good as it has to be beside the best one that is known."""
+        return fit(names, items, start, aim=min(one.point.cost for one in self.pool.values()))
 
     def _keep(self, found: Hypothesis) -> Hypothesis:
         """The better of a fit and what is known of its set."""
@@ -240,14 +259,21 @@ class SetSearch:
         for group in groups:
             names = {one.name for one in group}
             if alike & names or missing in names:
+                kept = self._kept(base, group)
                 for one in group:
-                    if one.name != missing and self._may_lead(base, one):
+                    if one.name != missing and self._may_lead(base, one, kept):
                         self._added(base, one)
 
-    def _may_lead(self, base: Hypothesis, one: Scored) -> bool:
+    def _kept(self, base: Hypothesis, group: Sequence[Scored]) -> float:
+        """How many times what derivatives promise an effect of a group of twins has brought, 1 at least."""
+        sets = [(one, self.pool.get(frozenset((*base.effects, one.name)))) for one in group if one.gain > 0.0]
+        brought = [(own.log_evidence - base.log_evidence) / one.gain for one, own in sets if own is not None]
+        return max([1.0, *brought])
+
+    def _may_lead(self, base: Hypothesis, one: Scored, kept: float = 1.0) -> bool:
         """Whether a set with one effect more comes near the best, if derivatives promise all but a part."""
         best = max(self.posterior(known) for known in self.pool.values())
-        hoped = self.posterior(base) + one.gain / self.rules.least_of_promise - self.catalogue.price
+        hoped = self.posterior(base) + kept * one.gain / self.rules.least_of_promise - self.catalogue.price
         return hoped > best - self.rules.class_width
 
     def _groups(self, scored: Sequence[Scored]) -> list[list[Scored]]:
@@ -293,7 +319,7 @@ class SetSearch:
             return self.pool[frozenset(names)]
         items = self.catalogue.items[one.name]
         if one.start is not None:
-            found = fit(names, (*base.items, *items), one.start)
+            found = self._fit(names, (*base.items, *items), one.start)
         else:
             found = self._fitted(base, one, names, items)
         self._added_before.add(step)
@@ -309,7 +335,7 @@ class SetSearch:
         every = (*base.items, *items)
         parts = (1.0,) if len(items) == 1 else (1.0, 0.3)
         first = self._best_start(base, items, [self._part(items, one.step, part) for part in parts])
-        found = fit(names, every, base.point if first is None else first)
+        found = self._fit(names, every, base.point if first is None else first)
         kept = found.log_evidence - base.log_evidence >= self.rules.least_of_promise * one.gain
         if len(items) > 1 or (kept and not items[0].repeat):
             return found
@@ -323,7 +349,7 @@ class SetSearch:
                 value = found.point.settings[item.key]
                 tried += [np.array([value + turn * item.repeat]) for turn in (-1.0, 1.0)]
             other = self._best_start(base, items, tried)
-            new = found if other is None else fit(names, every, other)
+            new = found if other is None else self._fit(names, every, other)
             if new.log_evidence <= found.log_evidence:
                 break
             found, tried = new, []

@@ -127,14 +127,20 @@ class MarginalSearch:
     def _judged_again(self, best: Hypothesis) -> Hypothesis:
         """The best set once noise and slopes in the cells are those that it leaves itself."""
         for _ in range(self.rules.most_judged if len(best.effects) == 1 else 1):
-            if not best.effects or set(best.effects) in self._judged_with:
+            if not best.effects or set(best.effects) in self._judged_with or self._is_judged_with_alike(best):
                 break
             self._judged_with.append(set(best.effects))
             self.report(f"noise and cells are judged again with {', '.join(best.effects)}")
-            prepared = prepare_again(self.prepared, best)
+            prepared = prepare_again(self.prepared, best, self.rules)
             self.sets, self.prepared = self.sets.on(prepared.null), prepared
             best = self.sets.settled(len(best.effects))
         return best
+
+    def _is_judged_with_alike(self, best: Hypothesis) -> bool:
+        """Whether noise and cells are those that a set of the same class leaves."""
+        last = self.sets.pool.get(frozenset(self._judged_with[-1])) if self._judged_with else None
+        same = last is not None and len(last.effects) == len(best.effects)
+        return same and best.log_evidence - last.log_evidence < self.rules.class_width
 
     def _at_ends(self, best: Hypothesis) -> list[str]:
         """Parameters at an end of their range that nature does not have."""
