@@ -45,7 +45,9 @@ _SOME = 512
 """Rows and columns of which slopes are taken."""
 
 
-def model_error(pixels: PixelFit, scale_sigma: float, learned_sigma_um: float = 0.0) -> PixelFit:
+def model_error(
+    pixels: PixelFit, scale_sigma: float, learned_sigma_um: NDArray[np.float32] | None = None
+) -> PixelFit:
     """Uncertainties with the error of the model in them, which chi-square shows, and of what was learned of it.
 
     What a wrong model leaves over is the same in neighbouring pixels; in the direction of the thickness, where it
@@ -57,7 +59,7 @@ def model_error(pixels: PixelFit, scale_sigma: float, learned_sigma_um: float = 
         The fit; its uncertainties are changed in place.
     scale_sigma : `float`
         Standard uncertainty of the scale of the thickness.
-    learned_sigma_um : `float`, optional
+    learned_sigma_um : `numpy.ndarray`, float32, shape ``(ny, nx)``, optional
         Standard uncertainty of the thickness from the nuisances [µm].
     """
     most = int(pixels.n_wavelengths.max(initial=0))
@@ -71,9 +73,10 @@ def model_error(pixels: PixelFit, scale_sigma: float, learned_sigma_um: float = 
     for row, column in zip(*np.nonzero(excess > 1.0 + scatter / np.sqrt(count)), strict=True):
         part = tuple(slice(_BLOCK_PX * k, _BLOCK_PX * (k + 1)) for k in (row, column))
         pixels.sigma[part] *= np.float32(np.sqrt(excess[row, column]))
-    if scale_sigma > 0.0 or learned_sigma_um > 0.0:
-        together = np.hypot(np.float32(scale_sigma) * pixels.value, np.float32(learned_sigma_um))
-        np.hypot(pixels.sigma, together, out=pixels.sigma)
+    if scale_sigma > 0.0:
+        np.hypot(pixels.sigma, np.float32(scale_sigma) * pixels.value, out=pixels.sigma)
+    if learned_sigma_um is not None:
+        np.hypot(pixels.sigma, learned_sigma_um, out=pixels.sigma)
     return pixels
 
 

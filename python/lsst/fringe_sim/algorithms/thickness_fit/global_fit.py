@@ -13,6 +13,7 @@ from .borders import settle_borders
 from .cell_size import choose_cell_size
 from .cells import Cells, average_cells, cell_edges, cell_independence, effective_number
 from .conclusion import contrast_map, model_error
+from .learned_error import learned_sigma
 from .mean_response import normalise_to_pixels
 from .nuisances import NuisanceFit, Nuisances
 from .pixels import PixelFit, calm_surface, fit_pixels
@@ -135,7 +136,9 @@ def global_fit(
     pixels = rescue_pixels(
         fringes, state.templates, pixels, border_slip, order, range_um=state.range_um, threads=threads
     )
-    pixels = model_error(pixels, state.nuisance.scale_sigma, state.nuisance.learned_sigma_um)
+    seen = replace(calmed, sigma_um=surface.sigma_um)
+    learned = learned_sigma(cells, seen, leaning, templates, state.free, state.nuisance, order)
+    pixels = model_error(pixels, state.nuisance.scale_sigma, learned)
     if state.common_sigma_um > 0.0:
         whole = np.hypot(pixels.sigma, np.float32(state.common_sigma_um))
         pixels = replace(pixels, sigma=np.asarray(whole, np.float32))

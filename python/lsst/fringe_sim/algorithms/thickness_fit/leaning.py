@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...compiled import kernel
 from .newton import score
 
-__all__ = ["Leanings", "lean_strip", "local_variance"]
+__all__ = ["Leanings", "lean_strip", "local_variance", "most_likely_shares", "responsibility"]
 
 FloatArray = NDArray[np.float64]
 
@@ -28,6 +28,7 @@ _ROUNDS, _ROUNDS_AROUND = 400, 4
 _REACH = 2
 """Cells on each side of one that are around it."""
 _SQUARE = range(2 * _REACH + 1)
+_TINY = 1e-30
 _WEIGHTS = np.geomspace(0.5, 512.0, 11).astype(np.float32)
 """Cells around one that all cells together may count for."""
 
@@ -84,17 +85,37 @@ def local_variance(
         return out
     likely = _likelihood(seen, surface_variance, together, alone, independence)
     some = likely[:: -(-len(likely) // _MOST_CELLS)].astype(float)
-    share = np.full(together.size, 1.0 / together.size)
-    for _ in range(_ROUNDS):
-        share = _responsibility(some, share).mean(axis=0)
+    share = _share_of_widths(some, alone == 0.0)
     foretold = _with_neighbours(likely, share.astype(np.float32), known)
-    out[known] = _responsibility(likely, foretold) @ (together + alone)
+    out[known] = responsibility(likely, foretold) @ (together + alone)
     return out
 
 
-def _responsibility(likely: NDArray[np.floating], share: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Probability of each pair of widths."""
-    mixed = likely * share
+def _share_of_widths(likely: FloatArray, together: NDArray[np.bool_]) -> FloatArray:
+    """Most likely share of each pair of widths; ``together`` are those where no pixel lies apart from its cell.
+
+    Noise hides how far pixels scatter by themselves where that is little. That they do is believed if it makes the
+    cells more likely than two free parameters do by themselves, a width and its share (Schwarz 1978, Ann. Stat. 6,
+    461): without that, whatever noise would hide would count as possible.
+    """
+    simple, free = (
+        most_likely_shares(likely, asked.astype(float)) for asked in (together, np.ones(together.size))
+    )
+    none, some = (float(np.log(np.maximum(likely @ share, _TINY)).sum()) for share in (simple, free))
+    return free if some - none > np.log(len(likely)) else simple
+
+
+def most_likely_shares(likely: FloatArray, start: FloatArray) -> FloatArray:
+    """Shares of each of some kinds, given the likelihood of each kind (second axis) for a number of cases."""
+    share = start / start.sum()
+    for _ in range(_ROUNDS):
+        share = responsibility(likely, share).mean(axis=0)
+    return share
+
+
+def responsibility(likely: NDArray[np.floating], share: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Probability of each kind in each case."""
+    mixed = np.maximum(likely * share, _TINY)
     return np.asarray(mixed / mixed.sum(axis=1, keepdims=True))
 
 
@@ -112,7 +133,7 @@ def _with_neighbours(
     shown = np.zeros((len(likely) + 1, share.size), np.float32)
     expected: NDArray[np.float32] = np.broadcast_to(share, likely.shape)
     for _ in range(_ROUNDS_AROUND):
-        shown[:-1] = _responsibility(likely, expected)
+        shown[:-1] = responsibility(likely, expected)
         beside, best = np.zeros_like(likely), -np.inf
         for near in neighbours:
             beside += shown[near]

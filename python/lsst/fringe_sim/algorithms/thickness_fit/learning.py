@@ -22,7 +22,7 @@ from .nuisances import OVERTONES, NuisanceFit, Nuisances, light_widths
 from .templates import FringeTemplates
 from .wavelengths import CommonError, common_error, shift_precision
 
-__all__ = ["learn"]
+__all__ = ["learn", "moves_of"]
 
 FloatArray = NDArray[np.float64]
 
@@ -36,8 +36,6 @@ _OVERTONE, _OVERTONE_BY_WAVELENGTH = 0.5, 0.2
 """Standard deviations of what is added of the overtones of the model: what wavelengths share, and what each has
 besides."""
 _TEMPLATE_MARGIN_UM = 0.5
-_MOST_ASKED = 1000
-"""Cells that show what an error of the nuisances does to the thickness."""
 _FREE = 1e-4
 """Precision of what has no prior."""
 
@@ -65,7 +63,7 @@ def learn(
     rounds : `int`, optional
         Most steps.
     final : `bool`, optional
-        Say how uncertain the thickness is from what was learned, which nobody asks of an order that is compared.
+        Keep the covariance of what was learned, which nobody asks of an order that is compared.
 
     Returns
     -------
@@ -153,15 +151,7 @@ class _Problem:
         found = np.full_like(thickness, np.nan)
         refine_row(value, self.cells.weight, table, fitted.start_um, fitted.step_um, thickness, found)
         found = np.where(np.isfinite(found), found, thickness)
-        place = np.clip((found.astype(float) - fitted.start_um) / fitted.step_um, 2.0, len(table) - 4.0)
-
-        def curve(at: FloatArray) -> FloatArray:
-            below = at.astype(int)
-            share = (at - below)[:, None]
-            return np.asarray(table[below] * (1.0 - share) + table[below + 1] * share)[:, :wavelengths]
-
-        model = curve(place)
-        slope = (curve(place + 2.0) - curve(place - 2.0)) / (4.0 * fitted.step_um)
+        model, slope = _curve(fitted, table, found)
         return found, model, slope, value[:, :wavelengths] - model
 
     def step(
@@ -350,31 +340,23 @@ class _Problem:
             contrast_sigma=contrast_sigma, shift_sigma_nm=shift_sigma, scale_sigma=scale,
             misfit=misfit.scale * squares, chi2=self.cells.temper * misfit.cost(each), prior=self._prior_chi2(fit),
             shared=float(shared_variances(standard, thickness, self.cells.order_um)[-1]),
-            learned_sigma_um=self._learned_sigma(fit, thickness, model, slope, variance) if final else 0.0,
+            covariance=variance if final else fit.covariance,
         )  # fmt: skip
 
-    def _learned_sigma(
-        self,
-        fit: NuisanceFit,
-        thickness: NDArray[np.float32],
-        model: FloatArray,
-        slope: FloatArray,
-        variance: FloatArray,
-    ) -> float:
-        """Rms uncertainty of the thickness from all that was learned but the common error of the wavelengths [µm]."""
-        some = slice(None, None, -(-len(thickness) // _MOST_ASKED))
-        wavelengths, size = self.base.n_wavelengths, self.base.n_wavelengths * self.own
-        problem = replace(self, cells=replace(self.cells, pattern=self.cells.pattern[some]))
-        each, common = problem._design(fit, thickness[some], model[some], slope[some])
-        lean = self.cells.weight[some, :wavelengths] * slope[some]
-        information = np.maximum((lean * slope[some]).sum(axis=1), 1e-30)
-        moves = (each * lean.T[:, None]).reshape(size, len(information))
-        moves = np.concatenate([moves, (common * lean.T[:, None]).sum(axis=0)]) / information
-        if self.free.wavelength_accuracy_nm > 0.0:
-            along = self._along(fit)
-            place = np.arange(self.own - 1, size, self.own)
+    def moves(self, fit: NuisanceFit) -> tuple[FloatArray, FloatArray]:
+        """See `moves_of`."""
+        thickness, wavelengths = self.cells.thickness_um, self.base.n_wavelengths
+        fitted = replace(self.templates(fit), mean_response=fit.mean_response)
+        model, slope = _curve(fitted, fitted.table(), thickness)
+        each, common = self._design(fit, thickness, model, slope)
+        lean = (self.cells.weight[:, :wavelengths] * slope).T
+        information = np.maximum((lean * slope.T).sum(axis=0), 1e-30)
+        moves = (each * lean[:, None]).reshape(wavelengths * self.own, -1)
+        moves = np.concatenate([moves, (common * lean[:, None]).sum(axis=0)]) / information
+        if self.free.wavelength_accuracy_nm > 0.0:  # what is common to them is the scale
+            along, place = self._along(fit), np.arange(self.own - 1, wavelengths * self.own, self.own)
             moves[place] -= np.outer(along, along @ moves[place]) / (along @ along)
-        return float(np.sqrt(np.mean(np.einsum("in,ij,jn->n", moves, variance, moves, optimize=True))))
+        return moves, information
 
     def _trust(self, rest: FloatArray, weight: FloatArray) -> tuple[Misfit, FloatArray, FloatArray]:
         """How far cells can be off, the chi-square of each, and how far it is to be trusted."""
@@ -389,6 +371,43 @@ class _Problem:
             return float(where @ precision @ where)
         where[np.arange(self.base.n_wavelengths) * self.own + self.own - 1] = 0.0
         return float(where @ precision @ where) + self._common(fit).cost
+
+
+def moves_of(
+    cells: LearningCells, base: FringeTemplates, free: Nuisances, fit: NuisanceFit
+) -> tuple[FloatArray, FloatArray]:
+    """What a change of all that was learned does to the thickness of each cell.
+
+    Parameters
+    ----------
+    cells, base, free : `LearningCells`, `FringeTemplates`, `Nuisances`
+        As for `learn`.
+    fit : `NuisanceFit`
+        What was learned.
+
+    Returns
+    -------
+    moves : `numpy.ndarray`, shape ``(n, n_cells)``
+        Thickness per unit of each parameter [µm]: those of one wavelength after the other, then what all share.
+        Without the common error of the wavelengths.
+    information : `numpy.ndarray`, shape ``(n_cells,)``
+        Inverse variance of the thickness from the noise of the cell [1/µm²].
+    """
+    return _Problem.of(cells, base, free).moves(fit)
+
+
+def _curve(
+    fitted: FringeTemplates, table: NDArray[np.float32], thickness_um: NDArray[np.float32]
+) -> tuple[FloatArray, FloatArray]:
+    """Amplitudes of templates, whose table it is, and their slopes [1/µm], shape ``(n, n_wavelengths)``."""
+    place = np.clip((thickness_um.astype(float) - fitted.start_um) / fitted.step_um, 2.0, len(table) - 4.0)
+
+    def at(place: FloatArray) -> FloatArray:
+        below = place.astype(int)
+        share = (place - below)[:, None]
+        return np.asarray(table[below] * (1.0 - share) + table[below + 1] * share)[:, : fitted.n_wavelengths]
+
+    return at(place), (at(place + 2.0) - at(place - 2.0)) / (4.0 * fitted.step_um)
 
 
 def _change(before: NuisanceFit, after: NuisanceFit) -> float:

@@ -3,6 +3,9 @@
 A cell at a crest may be taken for its mirror image on the other side, and all along a crest at that. So each cell is
 asked on the surface that its neighbours show and not where it was found: there it says how far it would move the
 surface, and how surely. Surfaces and cells are settled in turn.
+
+A step or a ridge is no surface of second degree: there all cells about a place leave over more than their noise,
+though hardly one of them does by itself. How much more is weighed against what the cells about other places leave over.
 """
 
 from __future__ import annotations
@@ -12,15 +15,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
+from scipy.special import gammaincinv
 
 from ...compiled import kernel
 from .cells import Cells
+from .leaning import most_likely_shares, responsibility
 from .newton import score
 from .pixels import LONE_CELL_PENALTY, SAME_SURFACE, CellSurface
 from .posterior import REACH
 from .templates import FringeTemplates
 
-__all__ = ["LocalSurface", "local_surface"]
+__all__ = ["LocalSurface", "local_surface", "shares_of_middle"]
 
 FloatArray = NDArray[np.float64]
 
@@ -37,6 +42,14 @@ _ROUNDS = 3
 _LONGEST_STEP = 0.1
 """Longest way, in orders, by which a cell asks to move a surface at once."""
 _AT_ONCE = 4096
+_FREEDOM = 25.0 - 6.0
+"""Cells of a window, less the terms of its surface."""
+_MEDIAN = 2.0 * float(gammaincinv(0.5 * _FREEDOM, 0.5))
+"""Median of the chi-square of a window."""
+_FACTORS = np.concatenate([[1.0], 1.2 * np.geomspace(1.0, 100.0, 12)])
+"""Factors on the variance of cells about their surface; a window tells a variance to a third."""
+_MOST_WINDOWS = 4096
+"""Windows that show how far surfaces do not fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +61,8 @@ class LocalSurface:
     terms : `numpy.ndarray`, float32, shape ``(ncy, ncx, 6)``
         Of 1, y, x, y², xy, x², with y and x in pixels from the centre of the cell [µm].
     sigma_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Standard uncertainty of the first from the noise of the cells [µm]; infinite where nobody asked.
+        Standard uncertainty of the first [µm]: the noise of the cells, and what they leave over beyond that of most;
+        infinite where nobody asked.
     holds : `numpy.ndarray`, bool, shape ``(ncy, ncx)``
         Whether the cell and its eight neighbours lie on their surfaces, and more cells show it than it has terms.
     """
@@ -94,7 +108,7 @@ def local_surface(
     ask(own)
     seen, usable = surface.thickness_um.astype(float), surface.known
     for _ in range(_TURNS):
-        _fit(surface, seen, np.where(usable, known, 0.0) / step**2, asked, order_um, found)
+        misfit = _fit(surface, seen, np.where(usable, known, 0.0) / step**2, asked, order_um, found)
         ask(chi2)
         # A cell is not on a surface that is half an order away, nor if it likes its own place so much better.
         away = np.abs(found.terms[..., 0] - surface.thickness_um)
@@ -103,6 +117,7 @@ def local_surface(
             step * gain / np.maximum(known, 1e-30), *(order_um * _LONGEST_STEP * np.array([-1, 1]))
         )
         seen = found.terms[..., 0] + move
+    _allow_for_misfit(found, asked, misfit)
     found.holds[:] &= surface.known & ~binary_dilation(surface.known & ~usable, np.ones((3, 3), bool))
     return found
 
@@ -114,32 +129,84 @@ def _fit(
     asked: NDArray[np.bool_],
     order_um: float,
     found: LocalSurface,
-) -> None:
-    """Surfaces through what was ``seen`` of the cells [µm], known to a ``precision`` [1/µm²], in place."""
-    centres = (surface.y_centre, surface.x_centre)
-    size = [max(float(np.diff(each).mean()) if len(each) > 1 else 1.0, 1.0) for each in centres]
-    scale = np.array([1.0, size[0], size[1], size[0] ** 2, size[0] * size[1], size[1] ** 2])
-    # Neighbours that turn by an order from cell to cell, or bend by what breaks a surface, are not on one.
-    prior = np.diag((order_um * np.array([1.0, 1.0, 1.0, *(SAME_SURFACE,) * 3])) ** -2.0)
-    every = np.nonzero(asked)
+) -> FloatArray:
+    """Surfaces through what was ``seen`` of the cells [µm], known to a ``precision`` [1/µm²], in place.
+
+    Returns two rows: what the cells about each that is asked leave over, as the chi-square of a whole window, and
+    their mean precision.
+    """
+    every, misfit = np.nonzero(asked), []
     for part in np.array_split(np.arange(every[0].size), max(-(-every[0].size // _AT_ONCE), 1)):
         y, x = (index[part] for index in every)
-        b, a, known = _around(precision, y, x)
-        up, over = (
-            (each[at] - each[own][:, None]) / one
-            for each, at, own, one in zip(centres, (b, a), (y, x), size, strict=True)
-        )
-        design = np.stack([np.ones_like(up), up, over, up * up, up * over, over * over], axis=-1)
+        b, a, known, design, scale = _window(surface, precision, y, x)
+        prior = _prior(order_um)
         away, trust = seen[b, a] - seen[y, x][:, None], np.ones_like(known)
         for _ in range(_ROUNDS):
             turned = (design * (known * trust)[..., None]).swapaxes(1, 2)
             terms = np.linalg.solve(turned @ design + prior, turned @ away[..., None])
             trust = (_TAIL + 1.0) / (_TAIL + known * (away - (design @ terms)[..., 0]) ** 2)
+        rest = (known * (away - (design @ terms)[..., 0]) ** 2).sum(axis=1)
+        number = np.count_nonzero(known, axis=1)
+        whole = rest * _FREEDOM / np.maximum(number - scale.size, 1)
+        misfit.append(np.stack([whole, known.sum(axis=1) / np.maximum(number, 1)]))
         terms[:, 0, 0] += seen[y, x]
         found.terms[y, x] = terms[..., 0] / scale
         normal = (design * known[..., None]).swapaxes(1, 2) @ design + prior
         found.sigma_um[y, x] = np.sqrt(np.linalg.inv(normal)[:, 0, 0])
-        found.holds[y, x] = np.count_nonzero(known, axis=1) > scale.size
+        found.holds[y, x] = number > scale.size
+    return np.concatenate(misfit, axis=1)
+
+
+def _allow_for_misfit(found: LocalSurface, asked: NDArray[np.bool_], misfit: FloatArray) -> None:
+    """Make the uncertainty larger where a layer steps, in place: cells about a place leave over more than elsewhere.
+
+    A place lies off its surface as the cells about it do, and the surface by what that makes of it.
+    """
+    chi2, precision = misfit
+    if chi2.size == 0:
+        return
+    chi2 = chi2 / max(float(np.median(chi2)) / _MEDIAN, 1.0)  # of all cells, pixels tell how far they lie off
+    log = -0.5 * (_FREEDOM * np.log(_FACTORS) + chi2[:, None] / _FACTORS)
+    likely = np.exp(log - log.max(axis=1, keepdims=True))
+    some = likely[:: -(-chi2.size // _MOST_WINDOWS)]
+    factor = responsibility(likely, most_likely_shares(some, np.ones(_FACTORS.size))) @ _FACTORS
+    variance = factor * found.sigma_um[asked].astype(float) ** 2
+    found.sigma_um[asked] = np.sqrt(variance + (factor - 1.0) / np.maximum(precision, 1e-30))
+
+
+def shares_of_middle(
+    surface: CellSurface,
+    precision: FloatArray,
+    y: NDArray[np.intp],
+    x: NDArray[np.intp],
+    order_um: float,
+) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
+    """Rows and columns of the cells about some, and the share of each in the surface of the one in the middle."""
+    b, a, known, design, _ = _window(surface, precision, y, x)
+    turned = (design * known[..., None]).swapaxes(1, 2)
+    share = np.linalg.solve(turned @ design + _prior(order_um), turned)[:, 0]
+    return b, a, np.asarray(share, float)
+
+
+def _prior(order_um: float) -> FloatArray:
+    """Neighbours that turn by an order from cell to cell, or bend by what breaks a surface, are not on one."""
+    return np.diag((order_um * np.array([1.0, 1.0, 1.0, *(SAME_SURFACE,) * 3])) ** -2.0)
+
+
+def _window(
+    surface: CellSurface, precision: FloatArray, y: NDArray[np.intp], x: NDArray[np.intp]
+) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray, FloatArray, FloatArray]:
+    """The cells of `_around`, terms of the second degree at each in units of a cell, and these units in pixels."""
+    centres = (surface.y_centre, surface.x_centre)
+    size = [max(float(np.diff(each).mean()) if len(each) > 1 else 1.0, 1.0) for each in centres]
+    b, a, known = _around(precision, y, x)
+    up, over = (
+        (each[at] - each[own][:, None]) / one
+        for each, at, own, one in zip(centres, (b, a), (y, x), size, strict=True)
+    )
+    design = np.stack([np.ones_like(up), up, over, up * up, up * over, over * over], axis=-1)
+    scale = np.array([1.0, size[0], size[1], size[0] ** 2, size[0] * size[1], size[1] ** 2])
+    return b, a, known, design, scale
 
 
 def _around(

@@ -173,8 +173,8 @@ class NuisanceFit:
         Mean response over the sensor to which level and contrast belong; empty if it is not known.
     chi2, prior : `float`
         Twice the negative logarithm of the probability of the cells looked at, and of the prior of the nuisances.
-    learned_sigma_um : `float`
-        Standard uncertainty of the thickness from all of this but the scale [µm].
+    covariance : `numpy.ndarray`, shape ``(n, n)``
+        Of all that was learned, in the order of `learning.moves_of`; empty if nobody asked.
     shared : `float`
         Variance of sums over cells relative to that of cells which err each by itself.
     """
@@ -193,7 +193,7 @@ class NuisanceFit:
     chi2: float = np.inf
     prior: float = 0.0
     shared: float = 1.0
-    learned_sigma_um: float = 0.0
+    covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
 
     @classmethod
     def none(cls, wavelengths: int, patterns: int = 0) -> NuisanceFit:
