@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse import csr_array
 
+from ...effects.disc_search import Disc, Discs
 from .channels import State
-from .discs import Disc, Discs
 from .fit import Design
 
 __all__ = ["best_thickness_step"]

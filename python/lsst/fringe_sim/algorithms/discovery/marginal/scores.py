@@ -13,6 +13,8 @@ from ....effects import Effect, Residuals
 from ....errors import OutOfRangeError
 from ...inference import Columns, Coordinate, Hypothesis, Point, effect_columns, in_best_orders, jumped
 from ...inference.coordinates import SECANT
+from .pairs import FEW, Promised, ScoredPair, best_pairs
+from .smooth import beside_smooth
 
 __all__ = ["Scored", "Scorer", "proposed"]
 
@@ -41,6 +43,11 @@ class Scorer:
         self.point, self.columns, self.sizes = point, columns, sizes
         self.base = point.information(columns, columns)
         self.gradient = point.score(columns) - columns.log_det
+        self.single: dict[str, Promised] = {}
+
+    def pairs(self) -> list[ScoredPair]:
+        """What two of the effects that were scored promise together, best first."""
+        return best_pairs(self.point, self.columns, self.single, _best_gain)
 
     def score(self, name: str, items: tuple[Coordinate, ...]) -> Scored | None:
         """What an effect promises by its derivatives; by the best of several secants where they may vanish."""
@@ -65,6 +72,9 @@ class Scorer:
         matrix = self.point.information(own, own) - self.point.information(own, self.columns) @ across
         gradient = self.point.score(own) - own.log_det - across.T @ self.gradient
         scale = np.array([item.scale for item in items])
+        if len(items) <= FEW and secant == SECANT:
+            side = np.array([item.side for item in items])
+            self.single.setdefault(name, Promised(own, np.asarray(across), gradient, scale, side))
         best, step, degrees = -math.inf, np.zeros(len(items)), 0
         for highest in sorted({item.refinement for item in items}):
             few = np.array([item.refinement <= highest for item in items])
@@ -101,7 +111,8 @@ def proposed(effect: Effect, items: tuple[Coordinate, ...], base: Hypothesis) ->
     left = (point.problem.data.value - point.value * point.levels[:, np.newaxis]).reshape(shape)
     weight = point.problem.data.weight.reshape(shape)
     best = None
-    for values in effect.propose(Residuals(np.where(weight > 0.0, left, 0.0), weight, geometry)):
+    steps = beside_smooth(point) if effect.local else (None, None)
+    for values in effect.propose(Residuals(np.where(weight > 0.0, left, 0.0), weight, geometry, *steps)):
         try:
             start = _begun(effect, items, values, point)
         except OutOfRangeError:
