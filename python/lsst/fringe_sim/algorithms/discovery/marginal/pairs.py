@@ -18,9 +18,6 @@ FloatArray = NDArray[np.float64]
 FEW = 2
 """Parameters of an effect up to which it is scored with another one: more of them explain what many others do."""
 
-MOST_PAIRS = 2
-"""Pairs that are kept for every set, the best first."""
-
 
 @dataclass(frozen=True, eq=False)
 class Promised:
@@ -48,7 +45,7 @@ def best_pairs(
     single: dict[str, Promised],
     gain_of: Callable[[FloatArray, FloatArray, FloatArray], tuple[float, FloatArray]],
 ) -> list[ScoredPair]:
-    """The pairs that promise most together, and more than the better of both promises alone.
+    """The pairs that promise more together than the better of both promises alone, best first.
 
     ``free``: columns that are free. ``single``: effects of few parameters. ``gain_of``: gain and step from
     information, score and scale of the priors.
@@ -72,14 +69,14 @@ def best_pairs(
     found: list[ScoredPair] = []
     for pair in itertools.combinations(single, 2):
         own = np.concatenate([place[name] for name in pair])
+        least = max(0.0, *(alone[name] for name in pair))
         most = 0.5 * float(gradient[own] @ np.linalg.lstsq(matrix[np.ix_(own, own)], gradient[own])[0])
-        least = found[MOST_PAIRS - 1].gain if len(found) >= MOST_PAIRS else 0.0
-        if most <= max(least, *(alone[name] for name in pair)):
+        if most <= least:
             continue
         both, step = gain(own)
-        if both > max(alone[name] for name in pair) and (step * side[own] >= 0.0).all():
-            found = sorted([*found, ScoredPair((pair[0], pair[1]), both, step)], key=lambda one: -one.gain)
-    return found[:MOST_PAIRS]
+        if both > least and (step * side[own] >= 0.0).all():
+            found.append(ScoredPair((pair[0], pair[1]), both, step))
+    return sorted(found, key=lambda one: -one.gain)
 
 
 def _joint(point: Point, free: Columns, singles: list[Promised]) -> tuple[FloatArray, FloatArray]:

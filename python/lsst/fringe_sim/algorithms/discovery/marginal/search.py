@@ -205,7 +205,8 @@ class SetSearch:
             return
         base = self.without(found, name)
         self.scores(base)
-        for pair in self._pairs[frozenset(base.effects)]:
+        others = [pair for pair in self._pairs[frozenset(base.effects)] if name not in pair.names]
+        for pair in others[: self.rules.fewest_refits]:
             names = (*base.effects, *pair.names)
             if frozenset(names) in self.pool or not self._is_hoped(base, pair.gain, 2):
                 continue
