@@ -9,7 +9,7 @@ import pytest
 
 from lsst.fringe_sim.algorithms.discovery.marginal import verdict
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
-from lsst.fringe_sim.algorithms.discovery.marginal.scores import Scorer
+from lsst.fringe_sim.algorithms.discovery.marginal.scores import Scorer, best_gain
 from lsst.fringe_sim.algorithms.discovery.marginal.search import Catalogue, SetSearch
 from lsst.fringe_sim.algorithms.inference import CellShape, Data, Forward, Hypothesis, Problem, fit, relaxed
 from lsst.fringe_sim.algorithms.inference.coordinates import SECANT
@@ -48,7 +48,7 @@ def test_a_pair_promises_what_its_parameters_do_together(rng: np.random.Generato
     scorer = Scorer(search.null.point, search.null.point.level_columns, Rules().sizes)
     for name in FEW:
         scorer.score(name, search.catalogue.items[name])
-    best = scorer.pairs()[0]
+    best = scorer.joint().best_pairs(best_gain, 0.0)[0]
     assert set(best.names) == {"bandwidth", "wavelength_offset"}
     items = tuple(item for name in best.names for item in search.catalogue.items[name])
     both = scorer._with_secant("both", items, SECANT)

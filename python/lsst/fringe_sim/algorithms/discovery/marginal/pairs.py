@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...inference import Columns, Point
+from ...inference import Columns, Coordinate, Point
 
-__all__ = ["FEW", "Promised", "ScoredPair", "best_pairs"]
+__all__ = ["FEW", "Joint", "Promised", "ScoredPair"]
 
 FloatArray = NDArray[np.float64]
 
@@ -23,11 +23,10 @@ FEW = 2
 class Promised:
     """One effect beside what is free at a point: its columns, and its score with all that is free projected out."""
 
+    items: tuple[Coordinate, ...]
     columns: Columns
     across: FloatArray  # (D, K): what the columns that are free make of it
     gradient: FloatArray  # (K,)
-    scale: FloatArray  # (K,): of the priors
-    side: FloatArray  # (K,): 1 or -1 where a parameter can depart to one side only, else 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,53 +38,55 @@ class ScoredPair:
     step: FloatArray  # linear step of the parameters of both from null
 
 
-def best_pairs(
-    point: Point,
-    free: Columns,
-    single: dict[str, Promised],
-    gain_of: Callable[[FloatArray, FloatArray, FloatArray], tuple[float, FloatArray]],
-) -> list[ScoredPair]:
-    """The pairs that promise more together than the better of both promises alone, best first.
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """Score and information of all effects of few parameters beside what is free."""
 
-    ``free``: columns that are free. ``single``: effects of few parameters. ``gain_of``: gain and step from
-    information, score and scale of the priors.
-    """
-    if len(single) < 2:
-        return []
-    ends = np.cumsum([len(one.gradient) for one in single.values()])
-    place = {
-        name: np.arange(end - len(one.gradient), end)
-        for (name, one), end in zip(single.items(), ends, strict=True)
-    }
-    matrix, gradient = _joint(point, free, list(single.values()))
-    scale, side = (
-        np.concatenate([getattr(one, what) for one in single.values()]) for what in ("scale", "side")
-    )
+    place: dict[str, NDArray[np.int_]]  # where the parameters of an effect stand
+    items: tuple[Coordinate, ...]
+    information: FloatArray  # (K, K)
+    gradient: FloatArray  # (K,)
 
-    def gain(own: NDArray[np.int_]) -> tuple[float, FloatArray]:
-        return gain_of(matrix[np.ix_(own, own)], gradient[own], scale[own])
+    @classmethod
+    def of(cls, point: Point, free: Columns, single: dict[str, Promised]) -> Joint:
+        """From the effects one by one; ``free``: columns that are free."""
+        items = tuple(item for one in single.values() for item in one.items)
+        if not items:
+            return cls({}, (), np.zeros((0, 0)), np.zeros(0))
+        ends = np.cumsum([len(one.items) for one in single.values()])
+        place = {
+            name: np.arange(end - len(one.items), end)
+            for (name, one), end in zip(single.items(), ends, strict=True)
+        }
+        own = [one.columns for one in single.values()]
+        every = Columns(
+            np.concatenate([one.value for one in own]),
+            np.concatenate([one.cells for one in own]),
+            np.concatenate([one.log_det for one in own]),
+        )
+        across = np.concatenate([one.across for one in single.values()], axis=1)
+        matrix = point.information(every, every) - point.information(every, free) @ across
+        gradient = np.concatenate([one.gradient for one in single.values()])
+        return cls(place, items, 0.5 * (matrix + matrix.T), gradient)
 
-    alone = {name: gain(own)[0] for name, own in place.items()}
-    found: list[ScoredPair] = []
-    for pair in itertools.combinations(single, 2):
-        own = np.concatenate([place[name] for name in pair])
-        least = max(0.0, *(alone[name] for name in pair))
-        most = 0.5 * float(gradient[own] @ np.linalg.lstsq(matrix[np.ix_(own, own)], gradient[own])[0])
-        if most <= least:
-            continue
-        both, step = gain(own)
-        if both > least and (step * side[own] >= 0.0).all():
-            found.append(ScoredPair((pair[0], pair[1]), both, step))
-    return sorted(found, key=lambda one: -one.gain)
+    def best_pairs(
+        self,
+        gain_of: Callable[[FloatArray, FloatArray, FloatArray], tuple[float, FloatArray]],
+        least: float,
+        without: Sequence[str] = (),
+    ) -> list[ScoredPair]:
+        """Pairs that promise more than a least gain together, best first.
 
-
-def _joint(point: Point, free: Columns, singles: list[Promised]) -> tuple[FloatArray, FloatArray]:
-    """Information ``(K, K)`` and score of the parameters of all effects beside what is free."""
-    every = Columns(
-        np.concatenate([one.columns.value for one in singles]),
-        np.concatenate([one.columns.cells for one in singles]),
-        np.concatenate([one.columns.log_det for one in singles]),
-    )
-    across = np.concatenate([one.across for one in singles], axis=1)
-    matrix = point.information(every, every) - point.information(every, free) @ across
-    return 0.5 * (matrix + matrix.T), np.concatenate([one.gradient for one in singles])
+        ``gain_of``: gain and step from information, score and scale of the priors. ``without``: effects of which no
+        pairs are made.
+        """
+        found = []
+        for pair in itertools.combinations([name for name in self.place if name not in without], 2):
+            own = np.concatenate([self.place[name] for name in pair])
+            matrix, gradient = self.information[np.ix_(own, own)], self.gradient[own]
+            if 0.5 * float(gradient @ np.linalg.lstsq(matrix, gradient)[0]) <= least:
+                continue
+            gain, step = gain_of(matrix, gradient, np.array([self.items[k].scale for k in own]))
+            if gain > least and all(self.items[k].side * x >= 0.0 for k, x in zip(own, step, strict=True)):
+                found.append(ScoredPair((pair[0], pair[1]), gain, step))
+        return sorted(found, key=lambda one: -one.gain)

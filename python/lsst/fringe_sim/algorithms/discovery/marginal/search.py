@@ -24,9 +24,9 @@ from ...inference import (
     jumped,
 )
 from ...inference.marginal import Point
-from .pairs import ScoredPair
+from .pairs import Joint
 from .rules import Rules
-from .scores import Scored, Scorer, proposed
+from .scores import Scored, Scorer, best_gain, proposed
 
 __all__ = ["Catalogue", "SetSearch"]
 
@@ -107,7 +107,7 @@ class SetSearch:
     def __post_init__(self) -> None:
         self.pool[frozenset()] = self.null
         self._scores: dict[frozenset[str], list[Scored]] = {}
-        self._pairs: dict[frozenset[str], list[ScoredPair]] = {}
+        self._joint: dict[frozenset[str], Joint] = {}
         self._added_before: set[tuple[frozenset[str], str]] = set()
         self._short: set[tuple[frozenset[str], str]] = set()  # fits that came far behind before
 
@@ -205,10 +205,10 @@ class SetSearch:
             return
         base = self.without(found, name)
         self.scores(base)
-        others = [pair for pair in self._pairs[frozenset(base.effects)] if name not in pair.names]
-        for pair in others[: self.rules.fewest_refits]:
+        joint, least = self._joint[frozenset(base.effects)], self._least_gain(base, 2)
+        for pair in joint.best_pairs(best_gain, least, (name,))[: self.rules.fewest_refits]:
             names = (*base.effects, *pair.names)
-            if frozenset(names) in self.pool or not self._is_hoped(base, pair.gain, 2):
+            if frozenset(names) in self.pool:
                 continue
             items = tuple(item for one in pair.names for item in self.catalogue.items[one])
             start = self._best_start(base, items, [self._part(items, pair.step, part) for part in PARTS])
@@ -298,13 +298,13 @@ class SetSearch:
 
     def _may_lead(self, base: Hypothesis, one: Scored) -> bool:
         """Whether a set with one effect more comes near the best, if derivatives promise all but a part."""
-        return self._is_hoped(base, one.gain, 1)
+        return one.gain > self._least_gain(base, 1)
 
-    def _is_hoped(self, base: Hypothesis, gain: float, number: int) -> bool:
-        """The same of so many effects that promise a gain together."""
+    def _least_gain(self, base: Hypothesis, number: int) -> float:
+        """What so many effects more must promise to come near the best."""
         best = max(self.posterior(known) for known in self.pool.values())
-        hoped = self.posterior(base) + gain / self.rules.least_of_promise - number * self.catalogue.price
-        return hoped > best - self.rules.class_width
+        behind = best - self.rules.class_width - self.posterior(base) + number * self.catalogue.price
+        return self.rules.least_of_promise * behind
 
     def _groups(self, scored: Sequence[Scored]) -> list[list[Scored]]:
         """Twins together, the best first."""
@@ -339,7 +339,7 @@ class SetSearch:
                 if one is not None:
                     found.append(one)
             self._scores[key] = sorted(found, key=lambda one: -one.gain)
-            self._pairs[key] = scorer.pairs()
+            self._joint[key] = scorer.joint()
         return self._scores[key]
 
     def _added(self, base: Hypothesis, one: Scored) -> Hypothesis:

@@ -26,6 +26,7 @@ from .heldout import Unseen, judge_unseen
 from .preparation import prepare, prepare_again
 from .rules import Rules
 from .search import Catalogue, SetSearch
+from .steps import told_of_steps
 
 __all__ = ["MarginalSearch"]
 
@@ -81,6 +82,7 @@ class MarginalSearch:
         if best.effects:
             return self._concluded(best)
         if total_chance(before) > self.rules.significance:
+            self.notes += told_of_steps(self.sets, null, self.rules)
             return self._told("no_discrepancy", null, before, (), {}, None)
         return self._unexplained(null, ["no effect of the catalogue explains it"], (), None)
 
