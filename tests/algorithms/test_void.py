@@ -13,6 +13,7 @@ from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.flat_residual import flat_residual
 from lsst.fringe_sim.challenge.sealed_cases import SealedCase, draw_case
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
+from lsst.fringe_sim.errors import UnknownNameError
 from lsst.fringe_sim.model import FringeModel
 
 (VOID,) = (effect for effect in EFFECTS if effect.name == "void")
@@ -205,3 +206,17 @@ def test_two_islands_of_one_effect_are_two_effects() -> None:
     assert len(np.unique(np.round(image[0][[13, 22, 0], [21, 8, 39]], 6))) == 3
     alone = replace(model, effects=model.effects[:1])
     assert len(alone.islands) == 1
+
+
+def test_a_sensor_may_have_several_voids() -> None:
+    """The second is called by its name and a number; effects of which there is one have no second."""
+    settings = {"void.thickness": 130.0, **PLACE, "void_2.thickness": 60.0, "void_2.centre_x": 8.0,
+                "void_2.centre_y": 22.0, "void_2.radius": 4.0}  # fmt: skip
+    model = FringeModel.from_setup("ts8_e2v", settings)
+    assert [item.effect.name for item, _ in model.islands] == ["void", "void_2"]
+    assert model.effect_settings == settings
+    image = model.flat_image(np.full((30, 40), 15.0), geometry((30, 40)))
+    assert len(np.unique(np.round(image[0][[13, 22, 0], [21, 8, 39]], 6))) == 3
+    for name in ("void_1.thickness", "void_x.thickness", "bandwidth_2.fwhm"):
+        with pytest.raises(UnknownNameError, match=name.partition(".")[0]):
+            FringeModel.from_setup("ts8_e2v", {name: 2.0})

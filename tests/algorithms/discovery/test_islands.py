@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.algorithms.discovery import discs as discs_module
 from lsst.fringe_sim.algorithms.discovery import islands
 from lsst.fringe_sim.algorithms.discovery.basis import CellBasis
 from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
-from lsst.fringe_sim.algorithms.discovery.discs import Discs
 from lsst.fringe_sim.algorithms.discovery.fit import Fit, Problem, coordinates_of, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare
 from lsst.fringe_sim.algorithms.discovery.selection import Selector
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS
+from lsst.fringe_sim.effects import disc_search as discs_module
+from lsst.fringe_sim.effects.disc_search import Discs
 from lsst.fringe_sim.model import FringeModel
 
 SHAPE = (40, 56)

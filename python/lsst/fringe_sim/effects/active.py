@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from ..errors import InputError, OutOfRangeError, UnknownNameError, to_number
 from ..instrument.sky import SkySpectrum
 from ..optics.system import OpticalSystem
-from .base import Described, Effect, FloatArray, ResponseContext
+from .base import Described, Effect, FloatArray, ResponseContext, numbered
 from .geometry import ImageGeometry
 
 AnyEffect = TypeVar("AnyEffect", bound=Described)
@@ -101,12 +101,21 @@ def check_settings(
     chosen: dict[str, dict[str, float]] = {}
     for effect, parameter, value in _flatten(settings):
         if effect not in by_name:
-            raise UnknownNameError("effect", effect, by_name)
+            by_name[effect] = another(effect, by_name)
         by_name[effect].parameter(parameter)
         number = to_number(f"{effect}.{parameter}", value)
         _check_bounds(by_name[effect], parameter, number)
         chosen.setdefault(effect, {})[parameter] = number
-    return tuple((effect, chosen[effect.name]) for effect in effects if effect.name in chosen)
+    return tuple((effect, chosen[name]) for name, effect in by_name.items() if name in chosen)
+
+
+def another(name: str, by_name: Mapping[str, AnyEffect]) -> AnyEffect:
+    """The second, third, ... of an effect, by its name."""
+    first, _, number = name.rpartition("_")
+    effect = by_name.get(first)
+    if not (isinstance(effect, Effect) and effect.several and number.isdecimal() and int(number) > 1):
+        raise UnknownNameError("effect", name, by_name)
+    return cast(AnyEffect, numbered(effect, int(number)))
 
 
 def _check_bounds(effect: Described, name: str, value: float) -> None:

@@ -7,6 +7,8 @@ effects must know besides is stated in one place, `Effect.search`.
 
 from __future__ import annotations
 
+import copy
+import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -29,6 +31,7 @@ __all__ = [
     "Residuals",
     "ResponseContext",
     "SearchHints",
+    "numbered",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -131,11 +134,16 @@ class Residuals:
         Inverse variance of the noise; 0 where there are no data.
     geometry : `ImageGeometry`
         Where the samples lie.
+    thickness_score, thickness_information : `numpy.ndarray`, shape ``(ny, nx)``, optional
+        Derivative of the log likelihood of the fitted thickness with respect to that of every sample [1/µm], and what
+        each tells of its own [1/µm²], beside a thickness that is smooth: a fine one takes up what looks like it.
     """
 
     value: FloatArray
     weight: FloatArray
     geometry: ImageGeometry
+    thickness_score: FloatArray | None = None
+    thickness_information: FloatArray | None = None
 
 
 @named_units
@@ -188,6 +196,8 @@ class Effect(Described, ABC):
     """``stack``, ``illumination``, ``response``, ``image`` or ``spectrum`` (of the night sky)."""
     local: ClassVar[bool] = False
     """Whether it changes the stack in a part of the sensor only, that of `coverage`."""
+    several: ClassVar[bool] = False
+    """Whether a sensor may have several of it: the second is called by its name and ``_2``, see `numbered`."""
     laboratory_only: ClassVar[bool] = False
     """Whether it belongs to lamp, bench or cryostat, which a sensor does not take along to the telescope."""
     sky_only: ClassVar[bool] = False
@@ -299,6 +309,14 @@ class Effect(Described, ABC):
     @abstractmethod
     def null_values(self, system: OpticalSystem) -> dict[str, float]:
         """Value of every parameter at which this effect leaves ``system`` as it is."""
+
+
+@functools.cache
+def numbered(effect: Effect, number: int) -> Effect:
+    """The second, third, ... of an effect of which a sensor may have several, with a name of its own."""
+    own = copy.copy(effect)
+    own.name, own.title = f"{effect.name}_{number}", f"{effect.title}, number {number}"
+    return own
 
 
 class PlainNullEffect(Effect):

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from .base import FloatArray, Parameter, Residuals, SearchHints, Values
-from .disc_search import find_disc
+from .disc_search import find_disc, find_step
 from .geometry import ImageGeometry
 from .stack import InsertedLayer
 
@@ -17,6 +17,9 @@ LEAST_SLANT = 1e-3
 
 SIZES_PER_REPETITION = 12
 """Gaps that are tried, up to one at which the fringes look nearly the same again."""
+
+THIN = (0.01, 0.02, 0.04, 0.08)
+"""Smaller ones, in units of that, where all that is seen is a step of the thickness."""
 
 
 class Void(InsertedLayer):
@@ -28,7 +31,7 @@ class Void(InsertedLayer):
 
     name = "void"
     title = "island on which the adhesive has come off"
-    local = True
+    local, several = True, True
     reference = "Born & Wolf, Principles of Optics, section 1.6 (layered media): a void between two layers"
     layer, medium, before = "void", "vacuum", "support"
     parameters = (
@@ -44,15 +47,21 @@ class Void(InsertedLayer):
     )
 
     def propose(self, residuals: Residuals) -> tuple[dict[str, float], ...]:
-        """The disc in which most is left, with gaps of all sizes."""
-        disc = find_disc(residuals)
-        if disc is None:
-            return ()
-        row, column, radius = disc
-        one = self.search.repeats_after["thickness"] / SIZES_PER_REPETITION
+        """The disc in which most is left, with all gaps, and that on which the thickness steps, with thin ones.
+
+        A thin gap moves the fringes and does little else, and a fine thickness takes that up.
+        """
+        one = self.search.repeats_after["thickness"]
+        sizes = one / SIZES_PER_REPETITION * np.arange(1, SIZES_PER_REPETITION + 1)
+        found = []
+        disc, step = find_disc(residuals), find_step(residuals)
+        if disc is not None:
+            found += [(disc, size) for size in sizes]
+        if step is not None:
+            found += [(step, size) for size in one * np.array(THIN)]
         return tuple(
-            {"thickness": number * one, "centre_x": column, "centre_y": row, "radius": radius}
-            for number in range(1, SIZES_PER_REPETITION + 1)
+            {"thickness": float(size), "centre_x": column, "centre_y": row, "radius": radius}
+            for (row, column, radius), size in found
         )
 
     def coverage(self, values: Values, geometry: ImageGeometry) -> FloatArray:

@@ -20,14 +20,14 @@ def continued(field: FloatArray, known: BoolArray) -> FloatArray:
     ``field`` (ny, nx): the field; its values elsewhere do not matter. ``known`` (ny, nx). Returns (ny, nx).
     """
     weight = np.where(known, 1.0, NO_WEIGHT).ravel()
-    matrix = sparse.diags(weight) + STIFFNESS * _curvature(*field.shape)
+    matrix = sparse.diags(weight) + STIFFNESS * curvature_of(*field.shape)
     middle = float(field[known].mean())
     right = weight * np.where(known, field - middle, 0.0).ravel()
     return np.asarray(middle + splu(matrix.tocsc()).solve(right).reshape(field.shape))
 
 
 @lru_cache(maxsize=2)
-def _curvature(rows: int, columns: int) -> sparse.spmatrix:
+def curvature_of(rows: int, columns: int) -> sparse.spmatrix:
     """Sum of squares of all second derivatives as a quadratic form in the cells, of every round of a growth."""
     bends = (
         sparse.kron(_differences(rows, 2), sparse.identity(columns)),

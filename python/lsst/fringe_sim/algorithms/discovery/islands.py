@@ -12,12 +12,12 @@ from scipy.ndimage import binary_dilation
 from scipy.optimize import minimize
 
 from ...array_types import BoolArray, FloatArray
+from ...effects.disc_search import Disc, Discs
 from ..parabola import parabolic_minimum
 from .cells import CellData
 from .channels import State, beside_thickness
 from .comparison import chi2_with_free_fringes, local_minima
 from .continuation import continued
-from .discs import Disc, Discs
 from .fit import Coordinate, Fit, Problem
 from .thickness_steps import best_thickness_step
 

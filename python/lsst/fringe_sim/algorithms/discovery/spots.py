@@ -35,13 +35,7 @@ def spot_channel(state: State, correlation: float = 0.0) -> Channel:
 
     .. [1] Worsley et al. 1996, Human Brain Mapping 4, 58
     """
-    scores = _Scores.of(state, correlation)
-    largest = max((found[0] for found in scores.maxima()), default=0.0)
-    chance = sum(
-        _chance_of_maximum(math.sqrt(largest), scores.shape, math.sqrt(2.0) * radius)
-        for radius in scores.radii
-    )
-    return Channel("spots", largest, 1.0, min(chance, 1.0))
+    return SpotScores.of(state, correlation).channel()
 
 
 def log_evidence_of_spots(state: State, correlation: float = 0.0) -> float:
@@ -50,23 +44,11 @@ def log_evidence_of_spots(state: State, correlation: float = 0.0) -> float:
     They are added one by one where they bring most, fitted together, and place, size and depth of each integrated by
     the Laplace approximation: equal chances for every place, for the logarithm of the size and for that of the depth.
     """
-    scores = _Scores.of(state, correlation)
-    spots: FloatArray = np.zeros((0, 4))
-    best = 0.0
-    for _ in range(MOST_SPOTS):
-        chi2, first = max(scores.beside(spots).maxima(), default=(0.0, (0.0, 0.0, 0.0, 0.0)))
-        if chi2 < WORTH_FITTING:
-            break
-        spots = scores.fitted(np.vstack([spots, first]))
-        evidence = scores.log_evidence(spots)
-        if evidence < best:
-            break
-        best = evidence
-    return best
+    return SpotScores.of(state, correlation).evidence()
 
 
 @dataclass(frozen=True, eq=False)
-class _Scores:
+class SpotScores:
     """Derivative and curvature of the likelihood with respect to the response of every cell.
 
     Beside the thickness of the cell, and beside the level that all have in common.
@@ -76,20 +58,52 @@ class _Scores:
     information: FloatArray
 
     @classmethod
-    def of(cls, state: State, correlation: float) -> _Scores:
+    def of(cls, state: State, correlation: float) -> SpotScores:
+        """Those of a state; ``correlation``: of the noise of neighbouring cells."""
         weighted = beside_thickness(state, state.whiten(state.value))
+        score, information = (state.residual * weighted).sum(axis=0), (weighted**2).sum(axis=0)
+        return cls.beside_level(score, information, correlation)
+
+    @classmethod
+    def beside_level(cls, score: FloatArray, information: FloatArray, correlation: float) -> SpotScores:
+        """From those of every cell beside its thickness ``(ny, nx)``."""
         inflation = 1.0 + 4.0 * max(correlation, 0.0)
-        information = (weighted**2).sum(axis=0) / inflation
-        score = (state.residual * weighted).sum(axis=0) / inflation
-        return cls(score - float(score.sum() / information.sum()) * information, information)
+        beside = score - float(score.sum() / information.sum()) * information
+        return cls(beside / inflation, information / inflation)
+
+    def channel(self) -> Channel:
+        """See `spot_channel`."""
+        largest = max((found[0] for found in self.maxima()), default=0.0)
+        chance = sum(
+            _chance_of_maximum(math.sqrt(largest), self.shape, math.sqrt(2.0) * radius)
+            for radius in self.radii
+        )
+        return Channel("spots", largest, 1.0, min(chance, 1.0))
+
+    def evidence(self) -> float:
+        """See `log_evidence_of_spots`."""
+        spots: FloatArray = np.zeros((0, 4))
+        best = 0.0
+        for _ in range(MOST_SPOTS):
+            chi2, first = max(self.beside(spots).maxima(), default=(0.0, (0.0, 0.0, 0.0, 0.0)))
+            if chi2 < WORTH_FITTING:
+                break
+            spots = self.fitted(np.vstack([spots, first]))
+            evidence = self.log_evidence(spots)
+            if evidence < best:
+                break
+            best = evidence
+        return best
 
     @property
     def shape(self) -> tuple[int, int]:
+        """Rows and columns of cells."""
         rows, columns = self.score.shape
         return rows, columns
 
     @property
     def radii(self) -> tuple[float, ...]:
+        """Those of the spots that fit on the sensor [cells]."""
         return tuple(radius for radius in RADII if 4.0 * radius <= min(self.shape))
 
     def maxima(self) -> Iterator[tuple[float, tuple[float, float, float, float]]]:
@@ -101,7 +115,7 @@ class _Scores:
             depth = amount[y, x] / max(variance[y, x], 1e-300)
             yield float(fall[y, x]), (float(y), float(x), math.log(radius), float(depth))
 
-    def beside(self, spots: FloatArray) -> _Scores:
+    def beside(self, spots: FloatArray) -> SpotScores:
         """The same with spots in the model."""
         return replace(self, score=self.score - self.information * self._pattern(spots))
 

@@ -10,8 +10,8 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse import csr_array
 
 from ...array_types import FloatArray
+from ...effects.disc_search import Disc, Discs
 from .channels import State
-from .discs import Disc, Discs
 from .fit import Design
 
 SMALLEST_RADIUS, MIDDLES_PER_RADIUS = 2.8, 2.0

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...effects import Effect, ImageGeometry, activate_effects, apply_to_image
+from ...effects.active import another
 from ...model import FringeModel
 from ...optics.illumination import Illumination
 from ..discovery.evaluations import note_evaluation
@@ -86,7 +87,10 @@ class Forward:
 
     def effect_of(self, key: str) -> Effect:
         """The effect that a setting belongs to."""
-        return self._by_name[key.partition(".")[0]]
+        name = key.partition(".")[0]
+        if name not in self._by_name:
+            self._by_name[name] = another(name, self._by_name)
+        return self._by_name[name]
 
     def predict(self, settings: Settings, thickness_um: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Signal of the cells relative to its mean level, and its derivative with respect to thickness [1/µm].

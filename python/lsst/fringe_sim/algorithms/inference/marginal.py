@@ -252,8 +252,13 @@ class Point:
         A cell that follows its noise leaves a mean residual of second order, half of the variance of its thickness
         times the second derivative; a score that falls on many cells would take that for an effect.
         """
-        left = 0.5 * self.projected(self._curved * self.thickness_sigma_um**2)
-        return np.asarray(self.score(columns) + np.tensordot(columns.value, left, axes=([1, 2], [0, 1])))
+        whole = np.tensordot(columns.value, self.unbiased_residual, axes=([1, 2], [0, 1]))
+        return np.asarray(whole - np.tensordot(columns.cells, self.residual_cells, axes=([1, 2], [0, 1])))
+
+    @cached_property
+    def unbiased_residual(self) -> FloatArray:
+        """The whitened residual without what a thickness that follows noise leaves on the average."""
+        return self.residual + 0.5 * self.projected(self._curved * self.thickness_sigma_um**2)
 
     def followed_um(self, step: FloatArray, columns: Columns) -> FloatArray:
         """Change of the thickness that goes with a step of dense parameters [µm]."""

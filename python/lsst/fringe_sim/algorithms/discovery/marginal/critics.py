@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -24,9 +25,11 @@ from ..channels import (
     texture_channels,
 )
 from ..fit import PlaneColumns, Whitener
+from ..spots import SpotScores
+from ..trends import FEWEST_DRAWS, trend_channel
 from .rules import Rules
 
-__all__ = ["CRITICS", "Judged", "judge", "state_of", "total_chance"]
+__all__ = ["CRITICS", "Judged", "judge", "spot_scores", "spots_instead", "state_of", "total_chance"]
 
 FloatArray = NDArray[np.float64]
 
@@ -114,20 +117,68 @@ def _texture(judged: Judged) -> list[Channel]:
     """Power at all scales against that at the finest, single waves, and copies of the image."""
     if judged.rows < FEWEST_ROWS["texture"]:
         return []
-    settings = judged.found.point.settings
-    correlation = sum(
-        effect.noise_correlation(effect.null_values(judged.found.point.problem.forward.model.base_system)
-                                 | _own(settings, effect.name), judged.geometry)
-        for effect in judged.found.point.problem.forward.catalogue if effect.name in judged.found.effects
-    )  # fmt: skip
-    return [*texture_channels(judged.state, correlation), echo_channel(judged.state)]
+    return [*texture_channels(judged.state, correlation_of(judged.found)), echo_channel(judged.state)]
+
+
+def _spots(judged: Judged) -> list[Channel]:
+    """The strongest round spot of all exposures."""
+    return [] if judged.rows < FEWEST_ROWS["texture"] else [spot_scores(judged.found).channel()]
+
+
+def _trends(judged: Judged) -> list[Channel]:
+    """Whether errors of single exposures are draws."""
+    found, forward = judged.found, judged.found.point.problem.forward
+    channels = []
+    for name in dict.fromkeys(item.effect for item in found.items if item.exchangeable):
+        effect = forward.effect_of(name)
+        place = np.array([
+            effect.parameter(item.parameter).wavelength_nm if item.effect == name else np.nan for item in found.items
+        ])  # fmt: skip
+        own = np.flatnonzero(np.isfinite(place))
+        if len(own) >= FEWEST_DRAWS:
+            covariance = found.covariance[np.ix_(own, own)]
+            channels.append(trend_channel(effect.title, place[own], found.values[own], covariance))
+    return channels
+
+
+def spot_scores(found: Hypothesis) -> SpotScores:
+    """Score and information of what all exposures have in common in a cell, beside its thickness and its response."""
+    point, shape = found.point, found.point.problem.forward.geometry.sample_shape
+    own = point._forward_solved(point._along(point.response))
+    score = (point.response * point.unbiased_residual).sum(axis=0) - (own * point.residual_cells).sum(axis=0)
+    information = (point.response**2).sum(axis=0) - (own**2).sum(axis=0)
+    return SpotScores.beside_level(score.reshape(shape), information.reshape(shape), correlation_of(found))
+
+
+def spots_instead(found: Hypothesis, without: Mapping[str, Hypothesis]) -> float:
+    """Log evidence of a few spots in the place of an effect of image or island, over that of the effect.
+
+    Gains of two amplifiers under a stain are most of the stain. ``without``: the set without each of its effects.
+    """
+    gains = [-math.inf]
+    for name, rest in without.items():
+        effect = found.point.problem.forward.effect_of(name)
+        if effect.acts_on == "image" or effect.local:
+            gains.append(spot_scores(rest).evidence() - (found.log_evidence - rest.log_evidence))
+    return max(gains)
+
+
+def correlation_of(found: Hypothesis) -> float:
+    """Correlation of the noise of neighbouring cells that the effects of a set account for."""
+    forward = found.point.problem.forward
+    effects = [forward.effect_of(name) for name in found.effects]
+    nulls = [effect.null_values(forward.model.base_system) for effect in effects]
+    return sum(
+        effect.noise_correlation({**null, **_own(found.point.settings, effect.name)}, forward.geometry)
+        for effect, null in zip(effects, nulls, strict=True)
+    )
 
 
 def _own(settings: dict[str, float], name: str) -> dict[str, float]:
     return {key.partition(".")[2]: value for key, value in settings.items() if key.partition(".")[0] == name}
 
 
-CRITICS: tuple[Critic, ...] = (_phase, _place, _texture)
+CRITICS: tuple[Critic, ...] = (_phase, _place, _texture, _spots, _trends)
 
 
 def judge(

@@ -13,8 +13,10 @@ from ....effects import Effect, Residuals
 from ....errors import OutOfRangeError
 from ...inference import Columns, Coordinate, Hypothesis, Point, effect_columns, in_best_orders, jumped
 from ...inference.coordinates import SECANT
+from .pairs import FEW, Joint, Promised
+from .smooth import beside_smooth
 
-__all__ = ["Scored", "Scorer", "proposed"]
+__all__ = ["Scored", "Scorer", "best_gain", "proposed", "residuals_of"]
 
 FloatArray = NDArray[np.float64]
 
@@ -41,6 +43,11 @@ class Scorer:
         self.point, self.columns, self.sizes = point, columns, sizes
         self.base = point.information(columns, columns)
         self.gradient = point.score(columns) - columns.log_det
+        self.single: dict[str, Promised] = {}
+
+    def joint(self) -> Joint:
+        """What the effects that were scored say of each other."""
+        return Joint.of(self.point, self.columns, self.single)
 
     def score(self, name: str, items: tuple[Coordinate, ...]) -> Scored | None:
         """What an effect promises by its derivatives; by the best of several secants where they may vanish."""
@@ -65,10 +72,12 @@ class Scorer:
         matrix = self.point.information(own, own) - self.point.information(own, self.columns) @ across
         gradient = self.point.score(own) - own.log_det - across.T @ self.gradient
         scale = np.array([item.scale for item in items])
+        if len(items) <= FEW and secant == SECANT:
+            self.single.setdefault(name, Promised(items, own, np.asarray(across), gradient))
         best, step, degrees = -math.inf, np.zeros(len(items)), 0
         for highest in sorted({item.refinement for item in items}):
             few = np.array([item.refinement <= highest for item in items])
-            gain, part = _best_gain(matrix[np.ix_(few, few)], gradient[few], scale[few])
+            gain, part = best_gain(matrix[np.ix_(few, few)], gradient[few], scale[few])
             if gain > best:
                 best, step = gain, np.zeros(len(items))
                 step[few] = part
@@ -80,7 +89,7 @@ class Scorer:
         return Scored(name, best, degrees, step, flat / max(float(np.linalg.norm(flat)), 1e-300))
 
 
-def _best_gain(matrix: FloatArray, gradient: FloatArray, scale: FloatArray) -> tuple[float, FloatArray]:
+def best_gain(matrix: FloatArray, gradient: FloatArray, scale: FloatArray) -> tuple[float, FloatArray]:
     """Largest gain of log evidence over the width of the prior, and its step."""
     best, step = -math.inf, scale * 0.0
     for width in WIDTHS:
@@ -93,15 +102,20 @@ def _best_gain(matrix: FloatArray, gradient: FloatArray, scale: FloatArray) -> t
     return best, step
 
 
-def proposed(effect: Effect, items: tuple[Coordinate, ...], base: Hypothesis) -> Scored | None:
-    """What an effect that is sought proposes itself, or nothing."""
-    point = base.point
+def residuals_of(point: Point) -> Residuals:
+    """What a point leaves of the data, and of the thickness beside a smooth one."""
     geometry = point.problem.forward.geometry
     shape = (len(point.levels), *geometry.sample_shape)
     left = (point.problem.data.value - point.value * point.levels[:, np.newaxis]).reshape(shape)
     weight = point.problem.data.weight.reshape(shape)
+    return Residuals(np.where(weight > 0.0, left, 0.0), weight, geometry, *beside_smooth(point))
+
+
+def proposed(effect: Effect, items: tuple[Coordinate, ...], base: Hypothesis) -> Scored | None:
+    """What an effect that is sought proposes itself, or nothing."""
+    point = base.point
     best = None
-    for values in effect.propose(Residuals(np.where(weight > 0.0, left, 0.0), weight, geometry)):
+    for values in effect.propose(residuals_of(point)):
         try:
             start = _begun(effect, items, values, point)
         except OutOfRangeError:

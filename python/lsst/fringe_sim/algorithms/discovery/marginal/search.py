@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ....effects import Effect
+from ....effects.base import numbered
 from ....errors import InputError, OutOfRangeError
 from ...inference import (
     Coordinate,
@@ -23,12 +25,16 @@ from ...inference import (
     jumped,
 )
 from ...inference.marginal import Point
+from .pairs import Joint
 from .rules import Rules
-from .scores import Scored, Scorer, proposed
+from .scores import Scored, Scorer, best_gain, proposed
 
 __all__ = ["Catalogue", "SetSearch"]
 
 FloatArray = NDArray[np.float64]
+
+PARTS = 1.0, 0.3
+"""Parts of a linear step of several parameters from which they are fitted: the whole may lead too far."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +44,17 @@ class Catalogue:
     items: dict[str, tuple[Coordinate, ...]]
     effects: dict[str, Effect]
     left_out: dict[str, str]
+    before: dict[str, str]  # of the second, third, ... of an effect the one before
 
     @classmethod
-    def of(cls, effects: Sequence[Effect], forward: Forward) -> Catalogue:
-        """Coordinates of all effects of a catalogue that these exposures can see."""
+    def of(cls, effects: Sequence[Effect], forward: Forward, most: int = 1) -> Catalogue:
+        """Coordinates of all effects of a catalogue that these exposures can see.
+
+        ``most``: of an effect of which a sensor may have several.
+        """
         items: dict[str, tuple[Coordinate, ...]] = {}
         left_out: dict[str, str] = {}
+        before: dict[str, str] = {}
         for effect in effects:
             try:
                 own = coordinates_of(effect, forward)
@@ -55,14 +66,26 @@ class Catalogue:
                 left_out[effect.name] = (
                     "a place that no derivative leads to, and the new core has no starts for it yet"
                 )
-            else:
-                items[effect.name] = own
-        return cls(items, {effect.name: effect for effect in effects}, left_out)
+                continue
+            items[effect.name], last = own, effect
+            for number in range(2, most + 1) if effect.several else ():
+                another = numbered(effect, number)
+                items[another.name] = tuple(replace(item, effect=another.name) for item in own)
+                effects, before, last = (*effects, another), {**before, another.name: last.name}, another
+        return cls(items, {effect.name: effect for effect in effects}, left_out, before)
 
     @property
     def price(self) -> float:
         """Log of the odds against any one effect before the data are seen."""
-        return math.log(max(len(self.items), 2))
+        return math.log(max(len(self.items) - len(self.before), 2))
+
+    def may_add(self, name: str, effects: Sequence[str]) -> bool:
+        """Whether an effect can be one more of a set."""
+        return name not in effects and self.before.get(name, name) in (name, *effects)
+
+    def may_leave(self, names: Sequence[str], effects: Sequence[str]) -> bool:
+        """Whether a set without some members is another one, without the second of an effect whose first is gone."""
+        return all(self.before.get(other) not in names for other in effects if other not in names)
 
 
 def _try(items: tuple[Coordinate, ...], forward: Forward) -> None:
@@ -85,6 +108,7 @@ class SetSearch:
     def __post_init__(self) -> None:
         self.pool[frozenset()] = self.null
         self._scores: dict[frozenset[str], list[Scored]] = {}
+        self._joint: dict[frozenset[str], Joint] = {}
         self._added_before: set[tuple[frozenset[str], str]] = set()
         self._short: set[tuple[frozenset[str], str]] = set()  # fits that came far behind before
 
@@ -97,7 +121,9 @@ class SetSearch:
         size = len(best.effects) + 1
         beam = self._of_size(size - 1)[: self.rules.beam] if best.effects else [self.null]
         self._grow(beam[0])
-        if best.effects and self._is_enough(beam[0]):
+        for name in best.effects:
+            self._exchange_for_two(best, name)
+        if best.effects and self._is_enough(beam[0]) and not self._is_beaten(best):
             return best
         for parent in beam[1:]:
             self._grow(parent, most=self.rules.refits // 2)
@@ -170,6 +196,28 @@ class SetSearch:
         promised = max((one.gain for one in self.scores(found)), default=0.0)
         return promised < self.catalogue.price and self.leaves_noise(found)
 
+    def _is_beaten(self, best: Hypothesis) -> bool:
+        """Whether a set of one effect more is surely better."""
+        return any(self._is_surely_better(one, best) for one in self._of_size(len(best.effects) + 1)[:1])
+
+    def _exchange_for_two(self, found: Hypothesis, name: str) -> None:
+        """Fit pairs in the place of one member, as far as they promise to come near the best set."""
+        if not self.catalogue.may_leave((name,), found.effects):
+            return
+        base = self.without(found, name)
+        self.scores(base)
+        joint, least = self._joint[frozenset(base.effects)], self._least_gain(base, 2)
+        for pair in joint.best_pairs(best_gain, least, (name,))[: self.rules.fewest_refits]:
+            names = (*base.effects, *pair.names)
+            if frozenset(names) in self.pool:
+                continue
+            items = tuple(item for one in pair.names for item in self.catalogue.items[one])
+            start = self._best_start(base, items, [self._part(items, pair.step, part) for part in PARTS])
+            both = self._fit(names, (*base.items, *items), base.point if start is None else start)
+            brings = both.log_evidence - base.log_evidence
+            self.say(f"  {'+'.join(names)}: promised {pair.gain:.1f} together, brings {brings:.1f}")
+            self._keep(both)
+
     def _of_size(self, size: int) -> list[Hypothesis]:
         """All sets of so many effects, best first."""
         found = [one for one in self.pool.values() if len(one.effects) == size]
@@ -183,7 +231,9 @@ class SetSearch:
         for found in grown[: self.rules.beam]:
             point, order_um = found.point, found.point.problem.forward.order_um
             starts = [in_whole_orders(point, self.rules.class_width)]
-            starts += [point.moved(point.levels, point.thickness_um + turn * order_um) for turn in (-1.0, 1.0)]
+            starts += [
+                point.moved(point.levels, point.thickness_um + turn * order_um) for turn in (-1.0, 1.0)
+            ]
             for start in starts:
                 if start is not point:
                     self._keep(self._fit(found.effects, found.items, start))
@@ -193,8 +243,11 @@ class SetSearch:
         """The best set after members were left out and exchanged, as long as that helps."""
         while True:
             for name in found.effects:
-                base = self.without(found, name)
-                self._grow(base, missing=name)
+                if self.catalogue.may_leave((name,), found.effects):
+                    self._grow(self.without(found, name), missing=name)
+            for pair in itertools.combinations(found.effects, 2):
+                if self.catalogue.may_leave(pair, found.effects):
+                    self._grow(self.without(self.without(found, pair[1]), pair[0]))
             best = max(
                 (one for one in self.pool.values() if len(one.effects) <= len(found.effects)),
                 key=self.posterior,
@@ -212,7 +265,8 @@ class SetSearch:
         items = tuple(item for item in found.items if item.effect != name)
         own = {item.key: item.null for item in found.items if item.effect == name}
         start = jumped(found.point, [i for i in found.items if i.effect == name], list(own.values()))
-        return self._keep(self._fit(names, items, self._without_keys(start, set(own))))
+        fitted = self._fit(names, items, self._without_keys(start, set(own)))
+        return self._keep(fitted) if self.catalogue.may_leave((name,), found.effects) else fitted
 
     @staticmethod
     def _without_keys(point: Point, keys: set[str]) -> Point:
@@ -272,9 +326,13 @@ class SetSearch:
 
     def _may_lead(self, base: Hypothesis, one: Scored, kept: float = 1.0) -> bool:
         """Whether a set with one effect more comes near the best, if derivatives promise all but a part."""
+        return kept * one.gain > self._least_gain(base, 1)
+
+    def _least_gain(self, base: Hypothesis, number: int) -> float:
+        """What so many effects more must promise to come near the best."""
         best = max(self.posterior(known) for known in self.pool.values())
-        hoped = self.posterior(base) + kept * one.gain / self.rules.least_of_promise - self.catalogue.price
-        return hoped > best - self.rules.class_width
+        behind = best - self.rules.class_width - self.posterior(base) + number * self.catalogue.price
+        return self.rules.least_of_promise * behind
 
     def _groups(self, scored: Sequence[Scored]) -> list[list[Scored]]:
         """Twins together, the best first."""
@@ -301,7 +359,7 @@ class SetSearch:
             scorer = Scorer(point, columns, self.rules.sizes)
             found = []
             for name, items in self.catalogue.items.items():
-                if name in base.effects:
+                if not self.catalogue.may_add(name, base.effects):
                     continue
                 effect = self.catalogue.effects[name]
                 sought = effect.search.sought or effect.local
@@ -309,6 +367,7 @@ class SetSearch:
                 if one is not None:
                     found.append(one)
             self._scores[key] = sorted(found, key=lambda one: -one.gain)
+            self._joint[key] = scorer.joint()
         return self._scores[key]
 
     def _added(self, base: Hypothesis, one: Scored) -> Hypothesis:
@@ -333,7 +392,7 @@ class SetSearch:
     ) -> Hypothesis:
         """The fit from the linear step; from elsewhere where that does not bring what it promised, or repeats."""
         every = (*base.items, *items)
-        parts = (1.0,) if len(items) == 1 else (1.0, 0.3)
+        parts = PARTS[:1] if len(items) == 1 else PARTS
         first = self._best_start(base, items, [self._part(items, one.step, part) for part in parts])
         found = self._fit(names, every, base.point if first is None else first)
         kept = found.log_evidence - base.log_evidence >= self.rules.least_of_promise * one.gain

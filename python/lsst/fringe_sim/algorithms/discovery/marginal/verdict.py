@@ -21,11 +21,12 @@ from ..classes import outsider_probability
 from ..describe import describe_residual, disagreement
 from ..evaluations import OutOfTimeError, time_limit
 from ..verdict import CONFIDENCE, Gap, NamedEffect, ParameterValue, Step, Verdict, probability_text
-from .critics import judge, state_of, total_chance
+from .critics import judge, spots_instead, state_of, total_chance
 from .heldout import Unseen, judge_unseen
 from .preparation import prepare, prepare_again
 from .rules import Rules
 from .search import Catalogue, SetSearch
+from .steps import told_of_steps
 
 __all__ = ["MarginalSearch"]
 
@@ -60,7 +61,7 @@ class MarginalSearch:
         self.notes = ["searched by one likelihood (core marginal)"]
         self._judged_with: list[set[str]] = []
         self._judged: dict[tuple[Hypothesis, Hypothesis], tuple[Channel, ...]] = {}
-        self.catalogue = Catalogue.of(effects, prepared.problem.forward)
+        self.catalogue = Catalogue.of(effects, prepared.problem.forward, rules.most_effects)
         self.sets = SetSearch(self.catalogue, prepared.null, rules, report, self._leaves_noise)
 
     def _leaves_noise(self, found: Hypothesis) -> bool:
@@ -81,6 +82,7 @@ class MarginalSearch:
         if best.effects:
             return self._concluded(best)
         if total_chance(before) > self.rules.significance:
+            self.notes += told_of_steps(self.sets, null, self.rules)
             return self._told("no_discrepancy", null, before, (), {}, None)
         return self._unexplained(null, ["no effect of the catalogue explains it"], (), None)
 
@@ -160,7 +162,9 @@ class MarginalSearch:
         weights = np.exp(np.minimum([self.sets.posterior(one) - top for one in pool], 0.0))
         explained = self.prepared.null.chi2 - best.chi2
         like = cast(Any, SimpleNamespace(names=best.effects, probability_of_noise=chance))
-        outsider = outsider_probability(like, self.rules.outsider_prior, explained)
+        without = {name: self.sets.without(best, name) for name in best.effects}
+        instead = spots_instead(best, without)
+        outsider = outsider_probability(like, self.rules.outsider_prior, explained, instead)
         named, doubts = [], []
         for name in best.effects:
             members = self._class_of(best, name)
@@ -169,7 +173,6 @@ class MarginalSearch:
             if probability < self.rules.least_probability:
                 doubts.append(f"the class of {name} has probability {probability_text(probability)} only")
             others = tuple(sorted((one for one in members if one != name), key=lambda one: -members[one]))
-            without = self.sets.without(best, name)
             named.append(
                 NamedEffect(
                     name,
@@ -178,7 +181,7 @@ class MarginalSearch:
                     others,
                     "further wavelengths; this search does not rank them yet" if others else "",
                     members[name] / sum(members.values()),
-                    math.sqrt(max(without.chi2 - best.chi2, 0.0)),
+                    math.sqrt(max(without[name].chi2 - best.chi2, 0.0)),
                 )
             )
         return tuple(sorted(named, key=lambda one: -one.significance)), doubts

@@ -1,0 +1,36 @@
+"""Steps of the thickness that a local effect explains as well, where the data do not tell which it is."""
+
+from __future__ import annotations
+
+from ....effects.disc_search import find_step
+from ...inference import Hypothesis
+from .rules import Rules
+from .scores import residuals_of
+from .search import SetSearch
+
+__all__ = ["told_of_steps"]
+
+
+def told_of_steps(sets: SetSearch, found: Hypothesis, rules: Rules) -> list[str]:
+    """Sentences for a verdict on local effects beside which the thickness of a set steps no more.
+
+    That layers do not step is knowledge that no flat holds: only what no thickness of the cells explains counts as
+    evidence for an effect.
+    """
+    if find_step(residuals_of(found.point)) is None:
+        return []
+    told = []
+    for one in sets.scores(found):
+        effect = sets.catalogue.effects[one.name]
+        if one.start is None or not effect.local or one.gain < -rules.class_width:
+            continue
+        if find_step(residuals_of(one.start)) is None:
+            values = ", ".join(
+                f"{item.parameter} {one.start.settings[item.key]:.3g} {item.unit}".strip()
+                for item in sets.catalogue.items[one.name]
+            )
+            told.append(
+                f"the thickness steps on an island as {one.name} would make it seem (about {values}): "
+                "these data cannot tell the two apart"
+            )
+    return told

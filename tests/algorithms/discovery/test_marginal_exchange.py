@@ -1,0 +1,118 @@
+"""One effect in the place of two, and two in the place of one."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.algorithms.discovery.marginal import verdict
+from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
+from lsst.fringe_sim.algorithms.discovery.marginal.scores import Scorer, best_gain
+from lsst.fringe_sim.algorithms.discovery.marginal.search import Catalogue, SetSearch
+from lsst.fringe_sim.algorithms.inference import CellShape, Data, Forward, Hypothesis, Problem, fit, relaxed
+from lsst.fringe_sim.algorithms.inference.coordinates import SECANT
+from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
+from lsst.fringe_sim.model import FringeModel
+
+WAVELENGTHS = np.linspace(900.0, 985.0, 8)
+FEW = ("epoxy_index", "bandwidth", "wavelength_offset", "contrast_loss")
+NOISE = 2e-3
+
+
+def search_of(rng: np.random.Generator, hidden: dict[str, float]) -> SetSearch:
+    """A search among a few effects on a few cells."""
+    effects = [effect for effect in EFFECTS if effect.name in FEW]
+    place = np.arange(12.0)
+    thickness = 14.0 + 0.035 * place + 0.02 * place[:, np.newaxis]
+    geometry = ImageGeometry((12, 12), place, place, WAVELENGTHS, np.full(8, 20_000.0))
+    shape = CellShape.of_field(thickness, 1)
+    forward = Forward(FringeModel.from_setup("ts8_e2v"), effects, geometry, shape, (13.2, 15.5))
+    value = forward.predict(hidden, thickness.ravel())[0]
+    value = value + NOISE * rng.standard_normal(value.shape)
+    problem = Problem(Data(value, np.full(value.shape, NOISE**-2.0)), forward, thickness.ravel(), 1e-5)
+    null = fit((), (), relaxed(problem.at({}, np.ones(8), thickness.ravel()), rounds=6))
+    return SetSearch(Catalogue.of(effects, forward), null, Rules(), lambda text: None, lambda found: True)
+
+
+def fitted(search: SetSearch, *names: str) -> Hypothesis:
+    """A set that the search knows."""
+    items = tuple(item for name in names for item in search.catalogue.items[name])
+    return search._keep(fit(names, items, search.null.point))
+
+
+@pytest.mark.rng("promise of pairs")
+def test_a_pair_promises_what_its_parameters_do_together(rng: np.random.Generator) -> None:
+    search = search_of(rng, {"bandwidth.fwhm": 2.2, "wavelength_offset.offset": 0.3})
+    scorer = Scorer(search.null.point, search.null.point.level_columns, Rules().sizes)
+    for name in FEW:
+        scorer.score(name, search.catalogue.items[name])
+    best = scorer.joint().best_pairs(best_gain, 0.0)[0]
+    assert set(best.names) == {"bandwidth", "wavelength_offset"}
+    items = tuple(item for name in best.names for item in search.catalogue.items[name])
+    both = scorer._with_secant("both", items, SECANT)
+    assert both is not None
+    assert best.gain == pytest.approx(both.gain, rel=1e-6)
+    assert best.step == pytest.approx(both.step, rel=1e-5)
+
+
+@pytest.mark.rng("one in the place of two")
+def test_one_effect_takes_the_place_of_two(rng: np.random.Generator) -> None:
+    search = search_of(rng, {"wavelength_offset.offset": 0.6})
+    two = fitted(search, "epoxy_index", "bandwidth")
+    assert search.posterior(two) > search.posterior(search.null) + 10.0
+    assert search._settled(two).effects == ("wavelength_offset",)
+
+
+@pytest.mark.rng("two in the place of one")
+def test_two_effects_take_the_place_of_one(rng: np.random.Generator) -> None:
+    search = search_of(rng, {"bandwidth.fwhm": 2.6, "wavelength_offset.offset": 0.6})
+    one = fitted(search, "epoxy_index")
+    search._exchange_for_two(one, "epoxy_index")
+    two = search.pool[frozenset({"bandwidth", "wavelength_offset"})]
+    assert search._is_beaten(one)
+    hidden = {"bandwidth.fwhm": 2.6, "wavelength_offset.offset": 0.6}
+    away = two.values - [hidden[item.key] for item in two.items]
+    assert (np.abs(away) < 4.0 * np.sqrt(np.diag(two.covariance))).all()
+
+
+@pytest.mark.rng("pairs that are not worth it")
+def test_two_effects_do_not_take_the_place_of_the_right_one(rng: np.random.Generator) -> None:
+    search = search_of(rng, {"wavelength_offset.offset": 0.6})
+    one = fitted(search, "wavelength_offset")
+    search._exchange_for_two(one, "wavelength_offset")
+    assert not search._is_beaten(one)
+    assert not any("wavelength_offset" in names for names in search.pool if len(names) == 2)
+
+
+@pytest.mark.parametrize(("number", "named"), [(1, True), (2, True), (3, False)])
+def test_one_cause_outside_the_catalogue_in_the_place_of_three_effects_leaves_them_without_a_name(
+    number: int, named: bool
+) -> None:
+    names = FEW[:number]
+    point = SimpleNamespace(
+        problem=SimpleNamespace(forward=SimpleNamespace(effect_of=lambda name: EFFECTS[0]))
+    )
+
+    def found(effects: tuple[str, ...], chi2: float) -> SimpleNamespace:
+        return SimpleNamespace(
+            effects=effects, chi2=chi2, log_evidence=-0.5 * chi2, items=(), values=np.zeros(0),
+            covariance=np.zeros((0, 0)), point=point,
+        )  # fmt: skip
+
+    best = found(names, 0.0)
+    own = SimpleNamespace(
+        sets=SimpleNamespace(
+            pool={frozenset(names): best},
+            posterior=lambda one: one.log_evidence,
+            without=lambda one, name: found(tuple(n for n in one.effects if n != name), 1e5),
+        ),
+        prepared=SimpleNamespace(null=found((), 1e6)),
+        rules=Rules(),
+        _class_of=lambda best, name: {name: 1.0},
+        _parameters=lambda best, name: {},
+    )
+    told, doubts = verdict.MarginalSearch._named(own, best, 0.5)  # type: ignore[arg-type]
+    assert len(told) == number
+    assert (not doubts) == named

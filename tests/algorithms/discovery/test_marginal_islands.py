@@ -1,0 +1,111 @@
+"""Local effects in the search on one likelihood: several of them, and such as look like a step of the thickness."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.interpolate import RectBivariateSpline
+
+from lsst.fringe_sim.algorithms.discovery import SearchOptions, discover
+from lsst.fringe_sim.algorithms.discovery.marginal.search import Catalogue
+from lsst.fringe_sim.algorithms.discovery.marginal.smooth import beside_smooth
+from lsst.fringe_sim.algorithms.inference import CellShape, Data, Forward, Point, Problem, relaxed
+from lsst.fringe_sim.effects import EFFECTS, ImageGeometry, Residuals
+from lsst.fringe_sim.effects.disc_search import find_step
+from lsst.fringe_sim.mock.thickness import random_field
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import FlatExposures, FringeCube
+
+WAVELENGTHS = np.linspace(880.0, 990.0, 12)
+ELECTRONS = 20_000.0
+SIDE = 64
+
+
+def void(name: str, gap_nm: float, x: float, y: float, radius: float) -> dict[str, float]:
+    """Settings of a void."""
+    return {
+        f"{name}.thickness": gap_nm, f"{name}.centre_x": x, f"{name}.centre_y": y, f"{name}.radius": radius
+    }  # fmt: skip
+
+
+def flats_of(rng: np.random.Generator, effects: dict[str, float]) -> FringeCube:
+    """Flats of pixels that see all of their area, with photon noise; the optics are the package's own."""
+    coarse, fine = np.arange(float(SIDE)), (np.arange(3.0 * SIDE) + 0.5) / 3.0 - 0.5
+    thickness = random_field((SIDE, SIDE), rng, mean=15.0, span=1.5)
+    model = FringeModel.from_setup("ts8_e2v", effects)
+    geometry = ImageGeometry((SIDE, SIDE), fine, fine, WAVELENGTHS, np.full(12, ELECTRONS))
+    flats = model.flat_image(RectBivariateSpline(coarse, coarse, thickness)(fine, fine), geometry)
+    flats = flats.reshape(12, SIDE, 3, SIDE, 3).mean(axis=(2, 4))
+    image = rng.poisson(ELECTRONS * flats / flats.mean(axis=(1, 2), keepdims=True)).astype(np.float32)
+    kelvin, width = model.base_system.temperature_k, model.setup.bandwidth_fwhm_nm
+    rows = FlatExposures(WAVELENGTHS, np.full(12, width), np.full(12, kelvin))
+    return FringeCube(image, np.maximum(image, 1.0), np.zeros(image.shape, np.int32), rows, "electron")
+
+
+@pytest.mark.slow
+def test_two_voids_are_named() -> None:
+    hidden = {"void": (130.0, 20.3, 17.6, 8.2), "void_2": (60.0, 45.0, 44.0, 10.0)}
+    settings = {key: value for name, own in hidden.items() for key, value in void(name, *own).items()}
+    cube = flats_of(np.random.default_rng([4, 3]), settings)
+    verdict = discover(cube, "ts8_e2v", rng=np.random.default_rng(5), options=SearchOptions(core="marginal"))
+    assert {effect.name for effect in verdict.effects} == set(hidden), verdict.summary()
+    for effect in verdict.effects:
+        found = effect.parameters
+        for key, true in void("", *hidden[effect.name]).items():
+            own = found[key.removeprefix(".")]
+            assert abs(own.value - true) < 4.0 * own.sigma + 1e-3 * true
+
+
+def point_of(rng: np.random.Generator, step_um: float) -> Point:
+    """Cells of which each has a thickness of its own, which is even but for a step on a disc."""
+    place = np.arange(40.0)
+    y, x = place[:, np.newaxis], place
+    even = 15.0 + 0.02 * x + 0.01 * y + 3e-4 * x * y
+    thickness = even + step_um * (np.hypot(y - 14.0, x - 22.0) < 7.0)
+    geometry = ImageGeometry((40, 40), place, place, WAVELENGTHS, np.full(12, ELECTRONS))
+    limits = float(even.min()) - 0.8, float(even.max()) + 0.8
+    forward = Forward(
+        FringeModel.from_setup("ts8_e2v"), EFFECTS, geometry, CellShape.of_field(even, 1), limits
+    )
+    value = forward.predict({}, thickness.ravel())[0] + 0.007 * rng.standard_normal((12, 1600))
+    problem = Problem(Data(value, np.full(value.shape, 0.007**-2.0)), forward, even.ravel(), 1e-3)
+    return relaxed(problem.at({}, np.ones(12), even.ravel()), rounds=6)
+
+
+def residuals_of(point: Point) -> Residuals:
+    """What is left of the thickness beside a smooth one, and the same everywhere of the data."""
+    geometry = point.problem.forward.geometry
+    even = np.ones((len(point.value), *geometry.sample_shape))
+    return Residuals(even, even, geometry, *beside_smooth(point))
+
+
+@pytest.mark.rng("step of the thickness")
+def test_a_step_of_the_thickness_is_found(rng: np.random.Generator) -> None:
+    step = find_step(residuals_of(point_of(rng, -0.008)))
+    assert step is not None
+    assert np.allclose(step, (14.0, 22.0, 7.0), atol=1.5)
+
+
+@pytest.mark.rng("step of the thickness")
+def test_thin_voids_are_proposed_there(rng: np.random.Generator) -> None:
+    (effect,) = (one for one in EFFECTS if one.name == "void")
+    starts = effect.propose(residuals_of(point_of(rng, -0.008)))
+    assert max(start["thickness"] for start in starts) < 50.0
+    assert np.allclose([start["centre_x"] for start in starts], 22.0, atol=1.5)
+
+
+@pytest.mark.rng("no step of the thickness")
+def test_noise_of_the_thickness_has_no_step(rng: np.random.Generator) -> None:
+    assert [find_step(residuals_of(point_of(rng, 0.0))) for _ in range(4)] == [None] * 4
+
+
+@pytest.mark.rng("second void beside the first")
+def test_the_second_of_an_effect_is_looked_for_beside_the_first(rng: np.random.Generator) -> None:
+    catalogue = Catalogue.of(EFFECTS, point_of(rng, 0.0).problem.forward, 3)
+    assert catalogue.before == {"void_2": "void", "void_3": "void_2"}
+    assert catalogue.may_add("void", ("bandwidth",))
+    assert not catalogue.may_add("void_2", ("bandwidth",))
+    assert catalogue.may_add("void_2", ("void",))
+    assert not catalogue.may_leave(("void",), ("void", "void_2"))
+    assert catalogue.may_leave(("void_2",), ("void", "void_2"))
+    assert catalogue.may_leave(("void", "void_2"), ("void", "void_2", "bandwidth"))
