@@ -24,7 +24,8 @@ from .evaluations import OutOfTimeError, time_limit
 from .fit import Fit, fit_model
 from .forward import Exposures
 from .hidden_islands import hidden_island
-from .learning import evidence_of_correction, learn
+from .lesson import evidence_of_correction, learned_beside
+from .neighbours import not_replaced
 from .next_frames import FrameForecast
 from .next_step import Ranking, flats_ranked, with_next_measurements
 from .options import SearchOptions
@@ -655,31 +656,23 @@ class _Search:
         return replace(found, learned=learned, accuracy=accuracy)
 
     def _alike(self, whole: Selector, found: Hypothesis) -> Hypothesis:
-        """The effects of a set that are not the cause, and which no correction can replace.
-
-        Without each of them, the others with the best correction beside them have less log evidence, by at least as
-        much as an effect must bring.
-        """
+        """The effects of a set that are not the cause, and which no correction can replace."""
         teaches = self.prepared.rich and not self.cells_are_of_sky
 
         def evidence(one: Hypothesis) -> float:
             return one.log_evidence + (evidence_of_correction(whole.problem, one.fit) if teaches else 0.0)
 
+        def smaller(one: Hypothesis) -> list[Hypothesis]:
+            return [
+                whole.hypothesis(tuple(n for n in one.names if n != name), None, one.fit)
+                for name in one.names
+            ]
+
         try:
             with time_limit(self.until):
-                reached = evidence(found) if found.names else 0.0
-                while found.names:
-                    smaller = [
-                        whole.hypothesis(tuple(n for n in found.names if n != name), None, found.fit)
-                        for name in found.names
-                    ]
-                    left, best = max(((evidence(one), one) for one in smaller), key=lambda pair: pair[0])
-                    if left < reached - self.options.least_evidence:
-                        break
-                    found, reached = best, left
+                return not_replaced(found, smaller, evidence, self.options.least_evidence)
         except OutOfTimeError:
             return whole.null
-        return found
 
     def _learned(self, whole: Selector, found: Hypothesis) -> dict[str, Any]:
         """A correction beside a set, judged by cells that it has not seen; nothing where there is none."""
@@ -688,7 +681,7 @@ class _Search:
         self.say("learning a correction from what is left")
         try:
             with time_limit(self.until):
-                learned = learn(
+                learned = learned_beside(
                     whole.problem,
                     whole.null.fit,
                     found.fit,
