@@ -164,6 +164,10 @@ class Part(ABC):
     def own_scores(self, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Scores of all that is free, for a whitened residual."""
 
+    def own_scores_of_data(self) -> tuple[FloatArray, FloatArray]:
+        """Those for the residual of the data."""
+        return self.own_scores(self.state.residual)
+
     @abstractmethod
     def projection(self, columns: Columns) -> tuple[Projected, FloatArray]:
         """Score of columns, from a residual and its `own_scores`, and their information."""
@@ -192,8 +196,11 @@ class Part(ABC):
 
     def scores(self, residuals: Sequence[FloatArray] | None = None) -> list[FloatArray]:
         """Scores ``(S, K)`` of all families for whitened residuals; for that of the data by default."""
-        asked = [self.state.residual] if residuals is None else residuals
-        own = [self.own_scores(residual) for residual in asked]
+        if residuals is None:
+            asked: Sequence[FloatArray] = [self.state.residual]
+            own = [self.own_scores_of_data()]
+        else:
+            asked, own = residuals, [self.own_scores(residual) for residual in residuals]
         return [
             np.stack([project(*pair) for pair in zip(asked, own, strict=True)])
             for project, _ in self._projected

@@ -54,26 +54,13 @@ from .validation import (
     whole_thickness,
 )
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where, probability_text
-from .verdict_words import chance_text
+from .verdict_words import METRIC, WITHIN_ACCURACY, chance_text, said_of_left_out
 
 __all__ = ["SearchOptions", "discover"]
 
 FloatArray = NDArray[np.float64]
 
-_METRIC = "rms of data minus model, relative counts"
-
 Report = Callable[[str], None]
-
-
-def _said_of_left_out(why: Mapping[str, str]) -> list[str]:
-    """Which effects were not looked for, those of one reason together."""
-    by_reason: dict[str, list[str]] = {}
-    for name, reason in why.items():
-        by_reason.setdefault(reason, []).append(name)
-    return [
-        f"{', '.join(names)} {'were' if len(names) > 1 else 'was'} left out: {reason}"
-        for reason, names in by_reason.items()
-    ]
 
 
 PAIR = 2
@@ -84,10 +71,6 @@ effect and a thickness that is wrong in places."""
 FEW_MENDED = 0.01
 """Part of the cells that may change their fringe order without moving where effects alone are by more than a fit that
 starts there finds."""
-
-WITHIN_ACCURACY = (
-    "model and data differ beyond noise, and by no more than the tables of the model may be wrong"
-)
 
 FOR_JUDGEMENT = 0.2
 """Part of a time budget that is kept for the judgement of the best answer on the data held out."""
@@ -162,16 +145,19 @@ def search_exposures(
             return _no_answer(model, poor, cube)
         begun, budget = time.monotonic(), chosen.time_budget_s
         search: _Search | MarginalSearch | None = None
+        left_to_present = _why_not_marginal(cube, exposures)
         try:
             with time_limit(begun + (1.0 - FOR_JUDGEMENT) * budget):
-                if chosen.core == "marginal" and exposures is None and _suits_marginal(cube):
+                if chosen.core == "marginal" and not left_to_present:
                     from .marginal import MarginalSearch  # is made of parts of this package
 
-                    search = MarginalSearch(cube, model, effects, rng, chosen.most_cells, say)
+                    search = MarginalSearch(cube, model, effects, rng, chosen, say)
                     return search.run()
                 say("fitting the thickness with the unchanged model")
                 prepared = prepare(cube, model, effects, chosen.most_cells, exposures)
                 search = _Search(cube, prepared, model, effects, chosen, rng, say)
+                if chosen.core == "marginal":
+                    search.remark(f"the present search answers, not core marginal: {left_to_present}")
                 return search.run()
         except OutOfTimeError:
             say(f"the search is stopped: {budget:g} s were given")
@@ -185,16 +171,22 @@ MARGINAL_ROWS = 24
 and one that is held out, and measure the noise of both."""
 
 
-def _suits_marginal(cube: FringeCube) -> bool:
-    """Whether the search on one likelihood can search such data."""
-    return cube.thickness is None and min(cube.shape[1:]) >= MARGINAL_ROWS
+def _why_not_marginal(cube: FringeCube, exposures: Exposures | None) -> str:
+    """Why the search on one likelihood cannot search such data, or nothing."""
+    if exposures is not None:
+        return "light of the sky"
+    if cube.thickness is not None:
+        return "a thickness that is known"
+    if min(cube.shape[1:]) < MARGINAL_ROWS:
+        return f"fewer than {MARGINAL_ROWS} rows or columns of pixels"
+    return ""
 
 
 def _no_answer(model: FringeModel, reason: str, cube: FringeCube, *, too_poor: bool = True) -> Verdict:
     nan = math.nan
     unexplained = {"reason": reason, "too_poor": too_poor}
     return Verdict(
-        "unexplained", (), Where(), Gap(_METRIC, nan, nan, nan, nan, nan), (), unexplained,
+        "unexplained", (), Where(), Gap(METRIC, nan, nan, nan, nan, nan), (), unexplained,
         model.setup.name, nan, data={"shape": list(cube.shape)},
     )  # fmt: skip
 
@@ -243,6 +235,11 @@ class _Search:
         """Go on with other field and noise; ``singles``: where effects alone are known to be."""
         self.prepared, self.cells, self._singles = prepared, prepared.problem.cells, singles
         self.notes = [*self.headers, *prepared.told]
+
+    def remark(self, text: str) -> None:
+        """Say something in the notes of the verdict."""
+        self.headers = (*self.headers, text)
+        self.notes.append(text)
 
     @property
     def _places(self) -> int:
@@ -725,9 +722,9 @@ class _Search:
         null = whole.null.fit
         before, after = misfit_rms(whole.problem, null), misfit_rms(whole.problem, final.fit)
         unseen = self.unseen or HeldOut(0.0, 0.0, before, after)
-        gap = Gap(_METRIC, before, after, unseen.before_rms, unseen.after_rms, self.cells.noise_rms)
+        gap = Gap(METRIC, before, after, unseen.before_rms, unseen.after_rms, self.cells.noise_rms)
         candidates = tuple({"name": c.name, "score": c.gain, "degrees": c.degrees} for c in self.scores)  # type: tuple[dict[str, Any], ...]
-        self.notes += _said_of_left_out(whole.left_out)
+        self.notes += said_of_left_out(whole.left_out)
         data = {
             "shape": list(self.cells.shape),
             "cell_px": self.cells.cell_px,

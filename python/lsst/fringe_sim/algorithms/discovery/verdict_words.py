@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from .verdict import Verdict
 
-__all__ = ["accuracy_text", "chance_text", "learned_text"]
+__all__ = ["METRIC", "WITHIN_ACCURACY", "accuracy_text", "chance_text", "learned_text", "said_of_left_out"]
+
+METRIC = "rms of data minus model, relative counts"
+
+WITHIN_ACCURACY = (
+    "model and data differ beyond noise, and by no more than the tables of the model may be wrong"
+)
 
 LEAST_CHANCE = 1e-300
 """Chances below this are not told: they are at the end of what a number can be."""
@@ -49,3 +56,14 @@ def learned_text(verdict: Verdict) -> str:
         f"{told['before_rms']:.6g} to {told['after_rms']:.6g}, noise floor {told['noise_floor']:.6g} "
         f"(chance of noise {told['chance']:.2g})"
     )
+
+
+def said_of_left_out(why: Mapping[str, str]) -> list[str]:
+    """Which effects were not looked for, those of one reason together."""
+    by_reason: dict[str, list[str]] = {}
+    for name, reason in why.items():
+        by_reason.setdefault(reason, []).append(name)
+    return [
+        f"{', '.join(names)} {'were' if len(names) > 1 else 'was'} left out: {reason}"
+        for reason, names in by_reason.items()
+    ]

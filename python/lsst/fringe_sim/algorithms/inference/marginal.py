@@ -184,6 +184,10 @@ class Point:
         us, ts = (np.einsum("wn,...wn->...n", own, slopes) for own in (self.response, self.steep))
         return Columns(values, cells, self._log_det_change(along, us, ts, cells))
 
+    def bare_columns(self, values: FloatArray) -> Columns:
+        """Dense columns ``(K, W, N)``; what they do to the log determinant is not asked."""
+        return Columns(values, self._forward_solved(self._along(values)), np.zeros(len(values)))
+
     @cached_property
     def level_columns(self) -> Columns:
         """Those of the levels."""
@@ -240,13 +244,18 @@ class Point:
         return np.asarray(whole - np.tensordot(columns.cells, self.residual_cells, axes=([1, 2], [0, 1])))
 
     def unbiased_score(self, columns: Columns) -> FloatArray:
-        """Derivative of the log likelihood, the thickness of every cell at its best, that is 0 on the average.
+        """Derivative of the log likelihood, the thickness of every cell at its best, that is 0 on the average."""
+        left = np.tensordot(columns.value, self.followed_mean, axes=([1, 2], [0, 1]))
+        return np.asarray(self.score(columns) + left)
 
-        A cell that follows its noise leaves a mean residual of second order, half of the variance of its thickness
-        times the second derivative; a score that falls on many cells would take that for an effect.
+    @cached_property
+    def followed_mean(self) -> FloatArray:
+        """What a thickness that follows its noise takes off the projected residual on the average, ``(W, N)``.
+
+        It is of second order, half of the variance of the thickness times the second derivative; a score that falls
+        on many cells would take it for an effect.
         """
-        left = 0.5 * self.projected(self._curved * self.thickness_sigma_um**2)
-        return np.asarray(self.score(columns) + np.tensordot(columns.value, left, axes=([1, 2], [0, 1])))
+        return 0.5 * self.projected(self._curved * self.thickness_sigma_um**2)
 
     def followed_um(self, step: FloatArray, columns: Columns) -> FloatArray:
         """Change of the thickness that goes with a step of dense parameters [µm]."""
@@ -268,6 +277,12 @@ class Point:
         """Part of the variance of unit noise that the projection leaves, ``(W, N)``."""
         solved = self._forward_solved(np.stack([self.response, self.steep], axis=-2))
         return np.asarray(1.0 - (solved**2).sum(axis=-2))
+
+    def misfit(self, free: int) -> float:
+        """Rms of the residual over that of noise, with so many dense parameters fitted."""
+        seen = self.problem.data.seen
+        left = float((self.projected(self.residual)[:, seen] ** 2).sum())
+        return float(np.sqrt(left / max(float(self.noise_share[:, seen].sum()) - free, 1.0)))
 
     @cached_property
     def thickness_sigma_um(self) -> FloatArray:

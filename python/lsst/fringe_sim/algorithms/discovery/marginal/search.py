@@ -22,6 +22,7 @@ from ...inference import (
     jumped,
 )
 from ...inference.marginal import Point
+from .pace import Pace
 from .rules import Rules
 from .scores import Scored, Scorer, proposed
 
@@ -80,6 +81,7 @@ class SetSearch:
     say: Callable[[str], None]
     leaves_noise: Callable[[Hypothesis], bool]  # what the critics say
     pool: dict[frozenset[str], Hypothesis] = field(default_factory=dict)
+    pace: Pace = field(default_factory=Pace)
 
     def __post_init__(self) -> None:
         self.pool[frozenset()] = self.null
@@ -130,6 +132,10 @@ class SetSearch:
                 self._keep(fit(one.effects, one.items, at))
         return self._of_size(len(best.effects))[0]
 
+    def best_of(self, size: int) -> Hypothesis:
+        """The best set of so many effects that is known; there is one of every size below that of the best."""
+        return self._of_size(size)[0]
+
     def best_so_far(self) -> Hypothesis:
         """The best set that is known, none larger than what is surely better."""
         best = self.null
@@ -140,7 +146,7 @@ class SetSearch:
 
     def on(self, null: Hypothesis) -> SetSearch:
         """The same search of a problem that was judged again; the best sets are fitted from where they are."""
-        again = SetSearch(self.catalogue, null, self.rules, self.say, self.leaves_noise)
+        again = SetSearch(self.catalogue, null, self.rules, self.say, self.leaves_noise, pace=self.pace)
         known = sorted(self.pool.values(), key=self.posterior, reverse=True)
         top = known[0].log_evidence - self.null.log_evidence
         # With one effect of several the noise is still that of a wrong model.
@@ -161,8 +167,7 @@ class SetSearch:
 
     def _is_surely_better(self, larger: Hypothesis, smaller: Hypothesis) -> bool:
         """Whether a larger set is as probable beside a smaller one as what is named has to be."""
-        odds = self.rules.least_probability / (1.0 - self.rules.least_probability)
-        return self.posterior(larger) - self.posterior(smaller) > math.log(odds)
+        return self.posterior(larger) - self.posterior(smaller) > self.rules.sure
 
     def _is_enough(self, found: Hypothesis) -> bool:
         """Whether a set leaves noise, and no effect promises to be worth its price beside it."""
@@ -230,6 +235,7 @@ class SetSearch:
         if missing:
             number = min(number, self.rules.fewest_refits)
         found: dict[str, Hypothesis] = {}
+        self.pace.left = min(number, len(groups))
         for group in groups[:number]:
             if self._may_lead(base, group[0]) or len(found) < fewest:
                 found[group[0].name] = self._added(base, group[0])
@@ -239,6 +245,7 @@ class SetSearch:
         alike = {name for name, one in found.items() if self.posterior(one) > top - self.rules.class_width}
         for group in groups:
             names = {one.name for one in group}
+            self.pace.left = len(group)
             if alike & names or missing in names:
                 for one in group:
                     if one.name != missing and self._may_lead(base, one):
@@ -292,14 +299,14 @@ class SetSearch:
         if step in self._added_before:
             return self.pool[frozenset(names)]
         items = self.catalogue.items[one.name]
-        if one.start is not None:
-            found = fit(names, (*base.items, *items), one.start)
-        else:
-            found = self._fitted(base, one, names, items)
+        with self.pace.fit():
+            if one.start is not None:
+                found = fit(names, (*base.items, *items), one.start)
+            else:
+                found = self._fitted(base, one, names, items)
         self._added_before.add(step)
-        self.say(
-            f"  {'+'.join(names)}: promised {one.gain:.1f}, brings {found.log_evidence - base.log_evidence:.1f}"
-        )
+        brought = f"promised {one.gain:.1f}, brings {found.log_evidence - base.log_evidence:.1f}"
+        self.say(f"  {'+'.join(names)}: {brought}{self.pace.text}")
         return self._keep(found)
 
     def _fitted(
