@@ -39,10 +39,16 @@ def accuracy_text(verdict: Verdict) -> str:
     if told.get("chance") is None:
         return ""
     beyond = "within" if verdict.within_accuracy else "beside"
-    return (
+    text = (
         f"{beyond} the accuracy of the model, {100.0 * told['assumed']:.2g} % of the fringes ({told['source']}): "
         f"chance {chance_text(told['chance'])} with it, {chance_text(verdict.global_probability)} of noise alone"
     )
+    if "log_evidence" in told:
+        text += (
+            f"; the best effects bring log evidence {told['log_evidence_within']:.1f} with it, "
+            f"{told['log_evidence']:.1f} with an exact model"
+        )
+    return text
 
 
 def learned_text(verdict: Verdict) -> str:

@@ -244,18 +244,18 @@ class Point:
         return np.asarray(whole - np.tensordot(columns.cells, self.residual_cells, axes=([1, 2], [0, 1])))
 
     def unbiased_score(self, columns: Columns) -> FloatArray:
-        """Derivative of the log likelihood, the thickness of every cell at its best, that is 0 on the average."""
-        left = np.tensordot(columns.value, self.followed_mean, axes=([1, 2], [0, 1]))
-        return np.asarray(self.score(columns) + left)
+        """Derivative of the log likelihood, the thickness of every cell at its best, that is 0 on the average.
+
+        A cell that follows its noise leaves a mean residual of second order, half of the variance of its thickness
+        times the second derivative; a score that falls on many cells would take that for an effect.
+        """
+        whole = np.tensordot(columns.value, self.unbiased_residual, axes=([1, 2], [0, 1]))
+        return np.asarray(whole - np.tensordot(columns.cells, self.residual_cells, axes=([1, 2], [0, 1])))
 
     @cached_property
-    def followed_mean(self) -> FloatArray:
-        """What a thickness that follows its noise takes off the projected residual on the average, ``(W, N)``.
-
-        It is of second order, half of the variance of the thickness times the second derivative; a score that falls
-        on many cells would take it for an effect.
-        """
-        return 0.5 * self.projected(self._curved * self.thickness_sigma_um**2)
+    def unbiased_residual(self) -> FloatArray:
+        """The whitened residual without what a thickness that follows noise leaves on the average."""
+        return self.residual + 0.5 * self.projected(self._curved * self.thickness_sigma_um**2)
 
     def followed_um(self, step: FloatArray, columns: Columns) -> FloatArray:
         """Change of the thickness that goes with a step of dense parameters [µm]."""

@@ -9,11 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....errors import OutOfRangeError
-from ...inference import Data, Hypothesis, Point, relaxed
-from ..continuation import continued
+from ...inference import Hypothesis, Point, relaxed
 from ..learning import SIZES, Prior
 from ..verdict_words import LEARNED_WORDS
-from .lesson import CellPart, in_own_cells, with_corrections
+from .lesson import (
+    CellPart,
+    data_of,
+    in_all_cells,
+    in_own_cells,
+    together,
+    unseen_too,
+    with_corrections,
+)
 from .preparation import Prepared
 
 __all__ = ["StandIn", "Unseen", "judge_unseen", "stand_in"]
@@ -66,23 +73,26 @@ def judge_unseen(prepared: Prepared, found: Hypothesis) -> Unseen | None:
     """Compare a set with the unchanged model on the part held out; nothing where there is none."""
     if not prepared.unseen.seen.any():
         return None
-    noise = prepared.unseen.noise_rms
-    before, after = (CellPart(_fitted(prepared, one.point), noise) for one in (prepared.null, found))
+    noise, cells = prepared.unseen.noise_rms, together(prepared)
+    # All are judged with cells as the best thickness shapes them.
+    whole = in_all_cells(unseen_too(prepared, found.point, cells), cells)
+    before, after = (CellPart(_fitted(prepared, one.point, whole), noise) for one in (prepared.null, found))
     told = Unseen(before.point.cost - after.point.cost, before.rms, after.rms)
     rival = stand_in(CellPart(with_corrections(prepared.point), noise), len(found.items))
     if rival is None:
         return told
-    other = _fitted(prepared, rival.point)
+    other = _fitted(prepared, rival.point, whole)
     return replace(told, stand_in=rival.words, stand_in_gain=before.point.cost - other.cost)
 
 
-def _fitted(prepared: Prepared, found: Point) -> Point:
-    """The held out cells with the effects of a point as they are; levels and cells are their own."""
-    cells = prepared.unseen
-    shape = cells.shape
-    data = Data(cells.value.reshape(shape[0], -1), cells.weight.reshape(shape[0], -1))
-    start = continued(found.thickness_um.reshape(shape[1:]), prepared.cells.seen).ravel()
-    problem = replace(found.problem, data=data, thickness_um=start)
+def _fitted(prepared: Prepared, found: Point, whole: Point) -> Point:
+    """The held out cells with the effects of a point as they are; levels and cells are their own.
+
+    ``whole``: a point whose cells have their shape.
+    """
+    start = unseen_too(prepared, found, together(prepared)).thickness_um
+    forward = replace(found.problem.forward, shape=whole.problem.forward.shape)
+    problem = replace(found.problem, data=data_of(prepared.unseen), forward=forward, thickness_um=start)
     return in_own_cells(problem.at(found.settings, found.levels, start))
 
 

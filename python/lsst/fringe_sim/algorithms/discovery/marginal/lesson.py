@@ -8,9 +8,10 @@ from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from ....effects import ImageGeometry
-from ...inference import Data, Forward, Hypothesis, Point, Problem, fit, in_best_orders, relaxed
+from ...inference import CellShape, Data, Hypothesis, Point, Problem, fit, in_best_orders, relaxed
 from ..cells import CellData
 from ..channels import State
 from ..continuation import continued
@@ -18,9 +19,19 @@ from ..fit import Columns, PlaneColumns, Projected, Whitener
 from ..learned_columns import with_learned
 from ..learning import Part, judging_cells
 from ..outliers import spoiled_cells
+from .noise import neighbour_scatter
 from .preparation import Prepared
 
-__all__ = ["CellLesson", "CellPart", "in_own_cells", "with_corrections"]
+__all__ = [
+    "CellLesson",
+    "CellPart",
+    "data_of",
+    "in_all_cells",
+    "in_own_cells",
+    "together",
+    "unseen_too",
+    "with_corrections",
+]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -29,16 +40,25 @@ BoolArray = NDArray[np.bool_]
 def with_corrections(point: Point) -> Point:
     """The same point of a model whose corrections may be set."""
     forward = point.problem.forward
-    known = Forward(
-        forward.model, with_learned(forward.catalogue), forward.geometry, forward.shape, forward.range_um,
-        forward.centroid,
-    )  # fmt: skip
+    known = replace(forward, catalogue=with_learned(forward.catalogue), _by_name={})
     return replace(point, problem=replace(point.problem, forward=known))
 
 
 def in_own_cells(first: Point) -> Point:
     """Levels and thickness of cells that had no part in a fit, at their best for its effects."""
     return relaxed(in_best_orders(relaxed(first, rounds=4)), rounds=6)
+
+
+def in_all_cells(point: Point, cells: CellData) -> Point:
+    """The same point, its cells shaped by the thickness of them all: where it was continued slopes were guessed.
+
+    ``cells``: those searched and those held out.
+    """
+    field = continued(point.thickness_um.reshape(cells.shape[1:]), cells.seen)
+    known = float(np.median(point.thickness_sigma_um[cells.seen.ravel()]))
+    shape = CellShape.of_field(field, cells.cell_px, max(known, neighbour_scatter(field, cells.seen, 0.0)))
+    problem = replace(point.problem, forward=replace(point.problem.forward, shape=shape))
+    return problem.at(point.settings, point.levels, point.thickness_um)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +89,7 @@ class CellPart(Part):
         point = self.point
         root, value = self._image(point.root), self._image(point.value * point.levels[:, np.newaxis])
         raw = np.where(root > 0.0, self._image(point.problem.data.value) - value, 0.0)
-        residual = self._image(point.residual + point.followed_mean)
+        residual = self._image(point.unbiased_residual)
         flat = Whitener(root, np.zeros(root.shape), np.zeros(root.shape[1:]))
         return State(cast(Any, None), residual, raw, value, self._image(point.thickness_um), flat)
 
@@ -121,7 +141,7 @@ class CellPart(Part):
 
     def own_scores_of_data(self) -> tuple[FloatArray, FloatArray]:
         """The same of the data, with what draws the thickness beside them."""
-        return self._beside(self.point.residual + self.point.followed_mean, self.point.residual_cells)
+        return self._beside(self.point.unbiased_residual, self.point.residual_cells)
 
     def _beside(self, flat: FloatArray, cells: FloatArray) -> tuple[FloatArray, FloatArray]:
         levels = self.point.level_columns
@@ -160,15 +180,13 @@ class CellLesson:
     @classmethod
     def of(cls, prepared: Prepared, found: Hypothesis) -> CellLesson:
         """From a set of effects that was fitted to the part searched."""
-        cells = _together(prepared)
-        point = with_corrections(found.point)
-        thickness = continued(point.thickness_um.reshape(cells.shape[1:]), prepared.cells.seen).ravel()
-        unseen = prepared.unseen.seen
-        point = replace(point, thickness_um=thickness).problem_with(_data(cells))
-        start = in_best_orders(point.moved(point.levels, thickness), unseen.ravel())
+        cells, unseen = together(prepared), prepared.unseen.seen
+        start = in_all_cells(unseen_too(prepared, with_corrections(found.point), cells), cells)
         left = (start.problem.data.value - start.levels[:, np.newaxis] * start.value).reshape(cells.shape)
         cells = cells.restricted(~(spoiled_cells(left, cells.weight > 0.0) & unseen))
-        return cls(found, replace(start.problem, data=_data(cells)), cells, unseen, start)
+        # Cells without data stay where they were.
+        problem = replace(start.problem, data=data_of(cells), thickness_um=start.thickness_um)
+        return cls(found, problem, cells, unseen, start)
 
     @property
     def judged(self) -> BoolArray:
@@ -200,7 +218,7 @@ class CellLesson:
 
     def _at(self, cells: BoolArray, point: Point, settings: dict[str, float]) -> Point:
         """The data of some of the cells, near a point."""
-        problem = replace(self.problem, data=_data(self.cells.restricted(cells)))
+        problem = replace(self.problem, data=data_of(self.cells.restricted(cells)))
         return problem.at(settings, point.levels, point.thickness_um)
 
 
@@ -209,11 +227,33 @@ def _point_of(part: Part) -> Point:
     return part.point
 
 
-def _data(cells: CellData) -> Data:
+def data_of(cells: CellData) -> Data:
+    """Values and weights of cells."""
     return Data(cells.value.reshape(cells.shape[0], -1), cells.weight.reshape(cells.shape[0], -1))
 
 
-def _together(prepared: Prepared) -> CellData:
+def unseen_too(prepared: Prepared, point: Point, cells: CellData) -> Point:
+    """A fit to the part searched, at all cells; those held out are in their likeliest place.
+
+    Fringes may be a few cells wide, and a thickness that is continued to the middle of a block be in another order.
+    So blocks are entered from their rims, and what is found there is continued, twice as far every time.
+
+    ``cells``: see `together`.
+    """
+    known, shape = prepared.cells.seen, cells.shape[1:]
+    away = distance_transform_edt(~known)
+    point = point.problem_with(data_of(cells))
+    reach = 1.0
+    while not known.all():
+        start = continued(point.thickness_um.reshape(shape), known).ravel()
+        near = away <= reach
+        moves = (near & ~known & cells.seen).ravel()
+        point = in_best_orders(point.moved(point.levels, start), moves, rounds=3)
+        known, reach = known | near, 2.0 * reach
+    return point
+
+
+def together(prepared: Prepared) -> CellData:
     """The part searched and the part held out, which is over a mean of its own, in the same units."""
     cells, unseen = prepared.cells, prepared.unseen
     ratio = unseen.geometry.level_e / cells.geometry.level_e

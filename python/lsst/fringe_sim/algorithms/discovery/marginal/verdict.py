@@ -255,7 +255,9 @@ class MarginalSearch:
         # table.
         ended = math.isinf(self.until) and not partial
         within = ended and accuracy.get("chance", 0.0) > self.rules.significance
-        alike = self.prepared.null if within else self._alike(found)
+        # What fails on data held out is like nothing.
+        fails = unseen is not None and unseen.gain <= 0.0
+        alike = self.prepared.null if within or fails else self._alike(found)
         state = state_of(found.point, found.point.level_columns)
         cells = self.prepared.cells
         description = {
