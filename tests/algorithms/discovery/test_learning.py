@@ -21,10 +21,9 @@ from lsst.fringe_sim.algorithms.discovery.learned_columns import LocalColumns
 from lsst.fringe_sim.algorithms.discovery.learning import (
     Learned,
     Prior,
-    evidence_of_correction,
     judging_cells,
-    learn,
 )
+from lsst.fringe_sim.algorithms.discovery.lesson import evidence_of_correction, learned_beside
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare
 from lsst.fringe_sim.algorithms.discovery.skeleton import effect_skeleton
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
@@ -87,7 +86,7 @@ def problem_of(seed: int, outsider: str = "") -> tuple[Problem, Fit]:
 
 def learned_from(problem: Problem, null: Fit) -> Learned | None:
     nowhere = np.zeros(problem.cells.shape[1:], dtype=bool)
-    return learn(problem, null, null, nowhere, np.random.default_rng(1), LEAST)
+    return learned_beside(problem, null, null, nowhere, np.random.default_rng(1), LEAST)
 
 
 @pytest.fixture(scope="module")

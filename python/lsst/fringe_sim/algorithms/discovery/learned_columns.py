@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...array_types import FloatArray
-from ...effects import AMPLIFIERS, LEARNED, ImageGeometry
+from ...effects import AMPLIFIERS, LEARNED, Effect, ImageGeometry
 from ...effects.learned import (
     LEARNED_HARMONICS,
     LEARNED_NODES_NM,
@@ -21,7 +22,7 @@ from ...effects.learned import (
     node_shares,
 )
 from .channels import State
-from .fit import Columns, Fit, PlaneColumns, Problem
+from .fit import Columns, PlaneColumns
 
 LENGTHS_NM = (1.0, 30.0, 100.0)
 """Correlation lengths over wavelength that are tried [nm]: none at all, some exposures, all of them."""
@@ -92,18 +93,36 @@ class Family:
     priors: tuple[tuple[str, FloatArray], ...]
 
 
-def with_learned(problem: Problem) -> Problem:
-    """The same problem with corrections among the effects that may be set."""
-    known = {effect.name for effect in problem.forward.catalogue}
-    added = [effect for effect in LEARNED if effect.name not in known]
-    return replace(problem, forward=replace(problem.forward, catalogue=[*problem.forward.catalogue, *added]))
+class Fitted(Protocol):
+    """Cells with a model fitted to them, as far as corrections look at it."""
+
+    @property
+    def settings(self) -> dict[str, float]:
+        """Effects by ``name.parameter``."""
+
+    @property
+    def state(self) -> State:
+        """Residual, model and noise."""
+
+    @property
+    def geometry(self) -> ImageGeometry:
+        """Centres of the cells, wavelengths."""
+
+    def change(self, settings: dict[str, float]) -> FloatArray:
+        """What other settings change in the data, at the same thickness and levels, ``(W, ny, nx)``."""
 
 
-def families(problem: Problem, fit: Fit, state: State, only: str = "") -> list[Family]:
+def with_learned(catalogue: Sequence[Effect]) -> list[Effect]:
+    """A catalogue with corrections among the effects that may be set."""
+    known = {effect.name for effect in catalogue}
+    return [*catalogue, *(effect for effect in LEARNED if effect.name not in known)]
+
+
+def families(fitted: Fitted, only: str = "") -> list[Family]:
     """All kinds of corrections at a fit, or the one of a name."""
-    geometry = problem.cells.geometry
+    geometry, state = fitted.geometry, fitted.state
     makers = {
-        "learned_response": lambda: _of_phase(problem, fit, state),
+        "learned_response": lambda: _of_phase(fitted),
         "learned_map": lambda: _of_map(geometry, state),
         "learned_light": lambda: _of_light(geometry, state),
     }
@@ -137,20 +156,19 @@ def _product(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.asarray(np.kron(first, second), dtype=float)
 
 
-def _of_phase(problem: Problem, fit: Fit, state: State) -> Family:
+def _of_phase(fitted: Fitted) -> Family:
     """Harmonics of the fringe at every wavelength."""
-    nodes, shares = _used_nodes(problem.cells.wavelength_nm)
+    settings, whiten = fitted.settings, fitted.state.whiten
+    nodes, shares = _used_nodes(fitted.geometry.wavelength_nm)
     waves = [f"{wave}{harmonic}" for harmonic in LEARNED_HARMONICS for wave in ("cos", "sin")]
-    _, level = problem.amplitudes(fit.levels)
     amplitude, step = [], 1e-3
     for wave in waves:
         names = [f"learned_response.{wave}_{node}" for node in LEARNED_NODES_NM]
-        setting = {name: fit.settings.get(name, 0.0) + step for name in names}
-        change = problem.forward.change(fit.settings, {**fit.settings, **setting}, state.thickness_um)
-        amplitude.append(state.whiten.root * level * change / step)
+        moved = {name: settings.get(name, 0.0) + step for name in names}
+        amplitude.append(whiten.root * fitted.change({**settings, **moved}) / step)
     planes = np.tile(np.arange(len(shares)), len(waves))
     basis = _product(np.eye(len(waves)), shares)
-    columns = PlaneColumns(np.concatenate(amplitude), planes, basis, state.whiten)
+    columns = PlaneColumns(np.concatenate(amplitude), planes, basis, whiten)
     keys = tuple(f"learned_response.{wave}_{node}" for wave in waves for node in nodes)
     priors = []
     for length in LENGTHS_NM:

@@ -10,18 +10,20 @@ same way.
 from __future__ import annotations
 
 import functools
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...array_types import BoolArray, FloatArray
+from ...effects import ImageGeometry
 from .channels import State
-from .fit import Design, Fit, Problem, Projected, fit_model, linearise_at
-from .learned_columns import Family, families, with_learned
-from .validation import FEWEST_ROWS, misfit_rms, thickness_starts
+from .fit import Columns, Projected
+from .learned_columns import Family, families
+from .validation import FEWEST_ROWS
 
 FALSE_ALARMS = 0.01  # Chance with which noise alone may seem to teach something
 
@@ -98,24 +100,81 @@ class Prior:
         return np.asarray((score @ self.turn * (square / (1.0 + square * self.known))) @ self.turn.T)
 
 
-@dataclass(frozen=True, eq=False)
-class _Side:
-    """One part of the cells, with all nuisances of a fit to it."""
+class Part(ABC):
+    """Cells with the model fitted to them: effects are held, and all else is projected out of what is asked.
 
-    state: State
-    families: list[Family]
-    projected: list[Projected]
-    information: list[FloatArray]
+    ``only``: the one family that is asked; all of them by default.
+    """
 
-    @classmethod
-    def of(cls, problem: Problem, fit: Fit, only: str = "") -> _Side:
-        design, residual, prediction, thickness, whiten = linearise_at(problem, fit)
-        value = problem.expected(fit.levels, prediction.value)
-        raw = np.where(problem.cells.weight > 0, problem.cells.value - value, 0.0)
-        state = State(design, residual, raw, value, thickness, whiten)
-        kinds = families(problem, fit, state, only)
-        both = [design.projection(family.columns) for family in kinds]
-        return cls(state, kinds, [each[0] for each in both], [each[1] for each in both])
+    only: str = ""
+
+    @property
+    @abstractmethod
+    def settings(self) -> dict[str, float]:
+        """Effects by ``name.parameter``."""
+
+    @property
+    @abstractmethod
+    def state(self) -> State:
+        """Residual, model and noise."""
+
+    @property
+    @abstractmethod
+    def geometry(self) -> ImageGeometry:
+        """Centres of the cells, wavelengths."""
+
+    @property
+    @abstractmethod
+    def chi2(self) -> float:
+        """χ² of all its cells."""
+
+    @property
+    @abstractmethod
+    def rms(self) -> float:
+        """Rms of data minus model, corrected for the freedom of the nuisances."""
+
+    @property
+    @abstractmethod
+    def planes(self) -> int:
+        """Random numbers that a cell needs for a draw of its noise."""
+
+    @abstractmethod
+    def chi2_of(self, cells: BoolArray) -> float:
+        """χ² of some of the cells ``(ny, nx)``."""
+
+    @abstractmethod
+    def change(self, settings: dict[str, float]) -> FloatArray:
+        """What other settings change in the data, at the same thickness and levels, ``(W, ny, nx)``."""
+
+    @abstractmethod
+    def of_noise(self, numbers: FloatArray) -> FloatArray:
+        """Whitened residual of nothing but noise, from random numbers ``(planes, ny, nx)``."""
+
+    @abstractmethod
+    def own_scores(self, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Scores of all that is free, for a whitened residual."""
+
+    def own_scores_of_data(self) -> tuple[FloatArray, FloatArray]:
+        """Those for the residual of the data."""
+        return self.own_scores(self.state.residual)
+
+    @abstractmethod
+    def projection(self, columns: Columns) -> tuple[Projected, FloatArray]:
+        """Score of columns, from a residual and its `own_scores`, and their information."""
+
+    @functools.cached_property
+    def families(self) -> list[Family]:
+        """Kinds of corrections."""
+        return families(self, self.only)
+
+    @functools.cached_property
+    def _projected(self) -> list[tuple[Projected, FloatArray]]:
+        return [self.projection(family.columns) for family in self.families]
+
+    @property
+    def information(self) -> list[FloatArray]:
+        """Of the parameters of every family, ``(K, K)``."""
+        return [information for _, information in self._projected]
 
     @functools.cached_property
     def priors(self) -> list[list[Prior]]:
@@ -125,14 +184,42 @@ class _Side:
             for family, information in zip(self.families, self.information, strict=True)
         ]
 
-    def scores(self, residuals: Sequence[FloatArray]) -> list[FloatArray]:
-        """Scores ``(S, K)`` of all families for whitened residuals."""
-        design: Design = self.state.design
-        own = [design.own_scores(residual) for residual in residuals]
+    def scores(self, residuals: Sequence[FloatArray] | None = None) -> list[FloatArray]:
+        """Scores ``(S, K)`` of all families for whitened residuals; for that of the data by default."""
+        if residuals is None:
+            asked: Sequence[FloatArray] = [self.state.residual]
+            own = [self.own_scores_of_data()]
+        else:
+            asked, own = residuals, [self.own_scores(residual) for residual in residuals]
         return [
-            np.stack([project(*pair) for pair in zip(residuals, own, strict=True)])
-            for project in self.projected
+            np.stack([project(*pair) for pair in zip(asked, own, strict=True)])
+            for project, _ in self._projected
         ]
+
+
+class Lesson(Protocol):
+    """What a search gives to learn from: cells that teach and cells that judge."""
+
+    @property
+    def judged(self) -> BoolArray:
+        """Cells that judge, ``(ny, nx)``."""
+
+    @property
+    def held_out(self) -> BoolArray:
+        """Cells that no choice of effects has seen, ``(ny, nx)``."""
+
+    @property
+    def noise_floor(self) -> float:
+        """Rms of what a perfect model leaves."""
+
+    def teaching(self) -> Part:
+        """The cells that teach, with the effects fitted to them; `Part.settings` are those of the effects."""
+
+    def again(self, taught: Part, settings: dict[str, float], only: str) -> Part:
+        """The same cells with other settings, which thickness and levels follow."""
+
+    def judging(self, taught: Part, settings: dict[str, float]) -> Part:
+        """The cells that judge, with thickness and levels of their own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +235,7 @@ class _Taught:
 
 
 def _taught(
-    seen: _Side, unseen: _Side, scores: list[FloatArray], wanted: list[FloatArray], least: float
+    seen: Part, unseen: Part, scores: list[FloatArray], wanted: list[FloatArray], least: float
 ) -> _Taught:
     """Learn from scores of the part that is seen, and predict those of the other part.
 
@@ -187,42 +274,26 @@ def judging_cells(shape: tuple[int, ...]) -> BoolArray:
     return np.asarray(rows[:, np.newaxis] & columns)
 
 
-def learn(
-    problem: Problem,
-    null: Fit,
-    best: Fit,
-    held_out: BoolArray,
-    rng: np.random.Generator,
-    least: float,
-) -> Learned | None:
+def learn(lesson: Lesson, rng: np.random.Generator, least: float) -> Learned | None:
     """Learn a correction beside the best fit; `None` where there are few cells, or nothing speaks for one.
 
     The choice of effects has seen all cells in the end. So the data are split anew: tiles all over the sensor judge,
     the cells around them teach. What the tiles in blocks say that no choice has seen stands beside.
 
-    ``null``, ``best``: fits of the unchanged model and of the best effects to all data. ``held_out`` (ny, nx): cells
-    that the choice of effects has not seen. ``rng``: draws the noise. ``least``: log evidence that a correction must
-    bring.
+    ``rng``: draws the noise. ``least``: log evidence that a correction must bring.
     """
-    judged = judging_cells(held_out.shape)
-    if not (judged & problem.cells.seen).any():
+    if not lesson.judged.any():
         return None
-    problem = with_learned(problem)
-    inside = problem.without_cells(judged)
-    outside = problem.with_cells(problem.cells.restricted(judged))
-    free = fit_model(inside, best.coordinates, best.position, best.field, best.levels, best.settings)
-    fitted = free.held()  # beside the effects as they are: free ones would take a part of the correction back
-    before = _beyond(problem, outside, null, fitted, judged, fitted.settings)
-    seen, unseen = _Side.of(inside, fitted), _Side.of(outside, before)
-    scores = [side.scores([side.state.residual]) for side in (seen, unseen)]
-    taught = _taught(seen, unseen, scores[0], scores[1], least)
+    seen = lesson.teaching()
+    unseen = lesson.judging(seen, seen.settings)
+    taught = _taught(seen, unseen, seen.scores(), unseen.scores(), least)
     if taught.evidence[0] <= least:
         return None
     family = seen.families[taught.family[0]]
-    fitted, own = _again(inside, fitted, family, taught)
-    after = _beyond(problem, outside, null, fitted, judged, {**fitted.settings, **own})
-    gain, drawn = before.chi2 - after.chi2, _of_noise(seen, unseen, rng, least)
-    strict = judged & held_out
+    fitted, own = _again(lesson, seen, family, taught)
+    after = lesson.judging(fitted, {**fitted.settings, **own})
+    gain, drawn = unseen.chi2 - after.chi2, _of_noise(seen, unseen, rng, least)
+    strict = lesson.judged & lesson.held_out
     return Learned(
         name=family.name,
         words=family.priors[taught.prior[0]][0],
@@ -231,26 +302,25 @@ def learn(
         own=own,
         log_evidence=float(taught.evidence[0]),
         heldout_gain=gain,
-        unseen_gain=_chi2_of(outside, before, strict) - _chi2_of(outside, after, strict),
+        unseen_gain=unseen.chi2_of(strict) - after.chi2_of(strict),
         chance=(1 + int((drawn >= gain).sum())) / (1 + len(drawn)),
-        before_rms=misfit_rms(outside, before),
-        after_rms=misfit_rms(outside, after),
-        noise_floor=problem.cells.noise_rms,
+        before_rms=unseen.rms,
+        after_rms=after.rms,
+        noise_floor=lesson.noise_floor,
     )
 
 
-def evidence_of_correction(problem: Problem, fit: Fit) -> float:
-    """Largest log evidence of a correction beside a fit, in all cells, over none; 0 where nothing speaks for one."""
-    side = _Side.of(with_learned(problem), fit.held())
+def best_evidence(part: Part) -> float:
+    """Largest log evidence of a correction, over none; 0 where nothing speaks for one."""
     best = [
         prior.best(score)[0][0]
-        for score, priors in zip(side.scores([side.state.residual]), side.priors, strict=True)
+        for score, priors in zip(part.scores(), part.priors, strict=True)
         for prior in priors
     ]
     return max(0.0, *(float(evidence) for evidence in best))
 
 
-def _again(inside: Problem, fitted: Fit, family: Family, taught: _Taught) -> tuple[Fit, dict[str, float]]:
+def _again(lesson: Lesson, seen: Part, family: Family, taught: _Taught) -> tuple[Part, dict[str, float]]:
     """The correction once more about itself, with thickness and levels that follow it.
 
     Where it is large, what it does is not in proportion to it.
@@ -258,44 +328,18 @@ def _again(inside: Problem, fitted: Fit, family: Family, taught: _Taught) -> tup
     known = taught.parameters[0]
     for _ in range(ROUNDS):
         own = dict(zip(family.keys, known.tolist(), strict=True))
-        fixed = {**fitted.settings, **own}
-        fitted = fit_model(inside, (), np.zeros(0), fitted.field, fitted.levels, fixed)
-        side = _Side.of(inside, fitted, family.name)
-        score = side.scores([side.state.residual])[0] + side.information[0] @ known
-        known = side.priors[0][taught.prior[0]].parameters(score, taught.size)[0]
-    return fitted, dict(zip(family.keys, known.tolist(), strict=True))
+        seen = lesson.again(seen, {**seen.settings, **own}, family.name)
+        score = seen.scores()[0] + seen.information[0] @ known
+        known = seen.priors[0][taught.prior[0]].parameters(score, taught.size)[0]
+    return seen, dict(zip(family.keys, known.tolist(), strict=True))
 
 
-def _chi2_of(problem: Problem, fit: Fit, cells: BoolArray) -> float:
-    """χ² of some of the cells ``(ny, nx)``."""
-    expected = problem.expected_of(fit)
-    residual = problem.whitener(expected)(problem.cells.value - expected)
-    return float((residual[:, cells] ** 2).sum())
-
-
-def _beyond(
-    problem: Problem,
-    outside: Problem,
-    null: Fit,
-    fitted: Fit,
-    judged: BoolArray,
-    settings: dict[str, float],
-) -> Fit:
-    """Thickness and levels fitted to the cells held out, effects and correction as they were learned."""
-    fields = [
-        problem.basis.fit(thickness, np.ones(judged.shape))
-        for thickness in thickness_starts(problem, null, fitted, judged)
-    ]
-    ends = [fit_model(outside, (), np.zeros(0), field, fitted.levels, settings) for field in fields]
-    return min(ends, key=lambda fit: fit.chi2)
-
-
-def _of_noise(seen: _Side, unseen: _Side, rng: np.random.Generator, least: float) -> FloatArray:
+def _of_noise(seen: Part, unseen: Part, rng: np.random.Generator, least: float) -> FloatArray:
     """Gains of what is learned from noise alone, ``(DRAWS,)``."""
     gains = []
+    shape = (seen.planes, *seen.state.residual.shape[1:])
     for first in range(0, DRAWS, AT_ONCE):
-        number = min(AT_ONCE, DRAWS - first)
-        noise = rng.standard_normal((number, *seen.state.residual.shape))
-        parts = [[np.where(side.state.residual != 0.0, one, 0.0) for one in noise] for side in (seen, unseen)]
+        noise = rng.standard_normal((min(AT_ONCE, DRAWS - first), *shape))
+        parts = [[side.of_noise(one) for one in noise] for side in (seen, unseen)]
         gains.append(_taught(seen, unseen, seen.scores(parts[0]), unseen.scores(parts[1]), least).gain)
     return np.concatenate(gains)

@@ -57,7 +57,7 @@ class FrameForecast:
             for other in rivals:
                 own = slice(first, first + 1 + len(self.coordinates[other]))
                 first = own.stop
-                now, then = _pair(present, own), _pair(after, own)
+                now, then = pair_of(present, own), pair_of(after, own)
                 pairs.append(PairForecast(name, other, now[0], then[0], now[1], then[1]))
             pairs.sort(key=lambda pair: pair.separation_after)
             ranked.append(RankedMeasurement(measurement, tuple(pairs)))
@@ -100,7 +100,7 @@ class FrameForecast:
         return design.project(features, np.zeros(problem.cells.shape))[1]
 
 
-def _pair(information: FloatArray, own: slice) -> tuple[float, float]:
+def pair_of(information: FloatArray, own: slice) -> tuple[float, float]:
     """Likeness of the effect and another one, and the standard deviations by which the other fits worse."""
     difference, tangent = own.start, slice(own.start + 1, own.stop)
     cross = information[tangent, difference]

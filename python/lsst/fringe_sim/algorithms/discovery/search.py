@@ -24,7 +24,8 @@ from .evaluations import OutOfTimeError, time_limit
 from .fit import Fit, fit_model
 from .forward import Exposures
 from .hidden_islands import hidden_island
-from .learning import evidence_of_correction, learn
+from .lesson import evidence_of_correction, learned_beside
+from .neighbours import not_replaced
 from .next_frames import FrameForecast
 from .next_step import Ranking, flats_ranked, with_next_measurements
 from .options import SearchOptions
@@ -53,22 +54,9 @@ from .validation import (
     whole_thickness,
 )
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where, probability_text
-from .verdict_words import chance_text
-
-_METRIC = "rms of data minus model, relative counts"
+from .verdict_words import METRIC, WITHIN_ACCURACY, chance_text, said_of_left_out
 
 Report = Callable[[str], None]
-
-
-def _said_of_left_out(why: Mapping[str, str]) -> list[str]:
-    """Which effects were not looked for, those of one reason together."""
-    by_reason: dict[str, list[str]] = {}
-    for name, reason in why.items():
-        by_reason.setdefault(reason, []).append(name)
-    return [
-        f"{', '.join(names)} {'were' if len(names) > 1 else 'was'} left out: {reason}"
-        for reason, names in by_reason.items()
-    ]
 
 
 PAIR = 2
@@ -79,10 +67,6 @@ effect and a thickness that is wrong in places."""
 FEW_MENDED = 0.01
 """Part of the cells that may change their fringe order without moving where effects alone are by more than a fit that
 starts there finds."""
-
-WITHIN_ACCURACY = (
-    "model and data differ beyond noise, and by no more than the tables of the model may be wrong"
-)
 
 FOR_JUDGEMENT = 0.2
 """Part of a time budget that is kept for the judgement of the best answer on the data held out."""
@@ -157,16 +141,19 @@ def search_exposures(
             return _no_answer(model, poor, cube)
         begun, budget = time.monotonic(), chosen.time_budget_s
         search: _Search | MarginalSearch | None = None
+        left_to_present = _why_not_marginal(cube, exposures)
         try:
             with time_limit(begun + (1.0 - FOR_JUDGEMENT) * budget):
-                if chosen.core == "marginal" and exposures is None and _suits_marginal(cube):
+                if chosen.core == "marginal" and not left_to_present:
                     from .marginal import MarginalSearch  # is made of parts of this package
 
-                    search = MarginalSearch(cube, model, effects, rng, chosen.most_cells, say)
+                    search = MarginalSearch(cube, model, effects, rng, chosen, say)
                     return search.run()
                 say("fitting the thickness with the unchanged model")
                 prepared = prepare(cube, model, effects, chosen.most_cells, exposures)
                 search = _Search(cube, prepared, model, effects, chosen, rng, say)
+                if chosen.core == "marginal":
+                    search.remark(f"the present search answers, not core marginal: {left_to_present}")
                 return search.run()
         except OutOfTimeError:
             say(f"the search is stopped: {budget:g} s were given")
@@ -180,16 +167,22 @@ MARGINAL_ROWS = 24
 and one that is held out, and measure the noise of both."""
 
 
-def _suits_marginal(cube: FringeCube) -> bool:
-    """Whether the search on one likelihood can search such data."""
-    return cube.thickness is None and min(cube.shape[1:]) >= MARGINAL_ROWS
+def _why_not_marginal(cube: FringeCube, exposures: Exposures | None) -> str:
+    """Why the search on one likelihood cannot search such data, or nothing."""
+    if exposures is not None:
+        return "light of the sky"
+    if cube.thickness is not None:
+        return "a thickness that is known"
+    if min(cube.shape[1:]) < MARGINAL_ROWS:
+        return f"fewer than {MARGINAL_ROWS} rows or columns of pixels"
+    return ""
 
 
 def _no_answer(model: FringeModel, reason: str, cube: FringeCube, *, too_poor: bool = True) -> Verdict:
     nan = math.nan
     unexplained = {"reason": reason, "too_poor": too_poor}
     return Verdict(
-        "unexplained", (), Where(), Gap(_METRIC, nan, nan, nan, nan, nan), (), unexplained,
+        "unexplained", (), Where(), Gap(METRIC, nan, nan, nan, nan, nan), (), unexplained,
         model.setup.name, nan, data={"shape": list(cube.shape)},
     )  # fmt: skip
 
@@ -238,6 +231,11 @@ class _Search:
         """Go on with other field and noise; ``singles``: where effects alone are known to be."""
         self.prepared, self.cells, self._singles = prepared, prepared.problem.cells, singles
         self.notes = [*self.headers, *prepared.told]
+
+    def remark(self, text: str) -> None:
+        """Say something in the notes of the verdict."""
+        self.headers = (*self.headers, text)
+        self.notes.append(text)
 
     @property
     def _places(self) -> int:
@@ -651,31 +649,23 @@ class _Search:
         return replace(found, learned=learned, accuracy=accuracy)
 
     def _alike(self, whole: Selector, found: Hypothesis) -> Hypothesis:
-        """The effects of a set that are not the cause, and which no correction can replace.
-
-        Without each of them, the others with the best correction beside them have less log evidence, by at least as
-        much as an effect must bring.
-        """
+        """The effects of a set that are not the cause, and which no correction can replace."""
         teaches = self.prepared.rich and not self.cells_are_of_sky
 
         def evidence(one: Hypothesis) -> float:
             return one.log_evidence + (evidence_of_correction(whole.problem, one.fit) if teaches else 0.0)
 
+        def smaller(one: Hypothesis) -> list[Hypothesis]:
+            return [
+                whole.hypothesis(tuple(n for n in one.names if n != name), None, one.fit)
+                for name in one.names
+            ]
+
         try:
             with time_limit(self.until):
-                reached = evidence(found) if found.names else 0.0
-                while found.names:
-                    smaller = [
-                        whole.hypothesis(tuple(n for n in found.names if n != name), None, found.fit)
-                        for name in found.names
-                    ]
-                    left, best = max(((evidence(one), one) for one in smaller), key=lambda pair: pair[0])
-                    if left < reached - self.options.least_evidence:
-                        break
-                    found, reached = best, left
+                return not_replaced(found, smaller, evidence, self.options.least_evidence)
         except OutOfTimeError:
             return whole.null
-        return found
 
     def _learned(self, whole: Selector, found: Hypothesis) -> dict[str, Any]:
         """A correction beside a set, judged by cells that it has not seen; nothing where there is none."""
@@ -684,7 +674,7 @@ class _Search:
         self.say("learning a correction from what is left")
         try:
             with time_limit(self.until):
-                learned = learn(
+                learned = learned_beside(
                     whole.problem,
                     whole.null.fit,
                     found.fit,
@@ -728,9 +718,9 @@ class _Search:
         null = whole.null.fit
         before, after = misfit_rms(whole.problem, null), misfit_rms(whole.problem, final.fit)
         unseen = self.unseen or HeldOut(0.0, 0.0, before, after)
-        gap = Gap(_METRIC, before, after, unseen.before_rms, unseen.after_rms, self.cells.noise_rms)
+        gap = Gap(METRIC, before, after, unseen.before_rms, unseen.after_rms, self.cells.noise_rms)
         candidates = tuple({"name": c.name, "score": c.gain, "degrees": c.degrees} for c in self.scores)  # type: tuple[dict[str, Any], ...]
-        self.notes += _said_of_left_out(whole.left_out)
+        self.notes += said_of_left_out(whole.left_out)
         data = {
             "shape": list(self.cells.shape),
             "cell_px": self.cells.cell_px,

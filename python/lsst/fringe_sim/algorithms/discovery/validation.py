@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -200,20 +201,28 @@ def degrees_of_freedom(problem: Problem, fit: Fit) -> int:
 
 
 def disagreement_size(problem: Problem, fit: Fit) -> dict[str, float]:
-    """Size of what a fit leaves beyond noise, as `Verdict.size` states it.
+    """Size of what a fit leaves beyond noise, as `Verdict.size` states it; see `size_beyond`."""
+    level, _ = problem.amplitudes(fit.levels)
+    pattern = (problem.expected_of(fit) / level - 1.0)[:, problem.cells.seen]
+    return size_beyond(_noise_and_misfit(problem, fit), pattern)
+
+
+def size_beyond(parts: Sequence[tuple[float, float, float]], pattern: FloatArray) -> dict[str, float]:
+    """Size of what is left beyond noise, as `Verdict.size` states it.
 
     Noise of single exposures and noise that all of them share, the scatter of the response of the cells, are compared
     with what is left of each: what all exposures share is lost in χ² where the response scatters. The limit takes
     the sum for a multiple of one chi-square (Satterthwaite 1946, doi 10.2307/3002019). Noise that happens to be small
     gives no limit below that of mean noise: power-constrained limits of Cowan et al. 2011.
+
+    ``parts``: variance of a value by noise, χ² and degrees of freedom, of each kind of noise. ``pattern`` (W, N): the
+    model over its level, of cells with data.
     """
-    variance, chi2, freedom = np.array(_noise_and_misfit(problem, fit)).T
+    variance, chi2, freedom = np.array(parts).T
     noise, left = float(variance.sum()), float((variance * chi2 / freedom).sum())
     degrees = noise**2 / float((variance**2 / freedom).sum())
     counts = math.sqrt(max(left - noise, 0.0))
     most = math.sqrt(max(max(left, noise) * degrees / float(chdtri(degrees, CONFIDENCE)) - noise, 0.0))
-    level, _ = problem.amplitudes(fit.levels)
-    pattern = (problem.expected_of(fit) / level - 1.0)[:, problem.cells.seen]
     fringes = math.sqrt(float(pattern.var(axis=1).mean())) if pattern.size else 0.0
     return {
         "of_counts": counts,

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from .verdict import Verdict
+
+METRIC = "rms of data minus model, relative counts"
+
+WITHIN_ACCURACY = (
+    "model and data differ beyond noise, and by no more than the tables of the model may be wrong"
+)
 
 LEAST_CHANCE = 1e-300  # Chances below this are not told: they are at the end of what a number can be
 
@@ -29,10 +36,16 @@ def accuracy_text(verdict: Verdict) -> str:
     if told.get("chance") is None:
         return ""
     beyond = "within" if verdict.within_accuracy else "beside"
-    return (
+    text = (
         f"{beyond} the accuracy of the model, {100.0 * told['assumed']:.2g} % of the fringes ({told['source']}): "
         f"chance {chance_text(told['chance'])} with it, {chance_text(verdict.global_probability)} of noise alone"
     )
+    if "log_evidence" in told:
+        text += (
+            f"; the best effects bring log evidence {told['log_evidence_within']:.1f} with it, "
+            f"{told['log_evidence']:.1f} with an exact model"
+        )
+    return text
 
 
 def learned_text(verdict: Verdict) -> str:
@@ -46,3 +59,14 @@ def learned_text(verdict: Verdict) -> str:
         f"{told['before_rms']:.6g} to {told['after_rms']:.6g}, noise floor {told['noise_floor']:.6g} "
         f"(chance of noise {told['chance']:.2g})"
     )
+
+
+def said_of_left_out(why: Mapping[str, str]) -> list[str]:
+    """Which effects were not looked for, those of one reason together."""
+    by_reason: dict[str, list[str]] = {}
+    for name, reason in why.items():
+        by_reason.setdefault(reason, []).append(name)
+    return [
+        f"{', '.join(names)} {'were' if len(names) > 1 else 'was'} left out: {reason}"
+        for reason, names in by_reason.items()
+    ]

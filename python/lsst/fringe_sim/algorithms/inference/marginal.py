@@ -191,6 +191,10 @@ class Point:
         us, ts = (np.einsum("wn,...wn->...n", own, slopes) for own in (self.response, self.steep))
         return Columns(values, cells, self._log_det_change(along, us, ts, cells))
 
+    def bare_columns(self, values: FloatArray) -> Columns:
+        """Dense columns ``(K, W, N)``; what they do to the log determinant is not asked."""
+        return Columns(values, self._forward_solved(self._along(values)), np.zeros(len(values)))
+
     @cached_property
     def level_columns(self) -> Columns:
         """Those of the levels."""
@@ -280,6 +284,12 @@ class Point:
         """Part of the variance of unit noise that the projection leaves, ``(W, N)``."""
         solved = self._forward_solved(np.stack([self.response, self.steep], axis=-2))
         return np.asarray(1.0 - (solved**2).sum(axis=-2))
+
+    def misfit(self, free: int) -> float:
+        """Rms of the residual over that of noise, with so many dense parameters fitted."""
+        seen = self.problem.data.seen
+        left = float((self.projected(self.residual)[:, seen] ** 2).sum())
+        return float(np.sqrt(left / max(float(self.noise_share[:, seen].sum()) - free, 1.0)))
 
     @cached_property
     def thickness_sigma_um(self) -> FloatArray:

@@ -41,17 +41,26 @@ FEWEST_ROWS = {"phase": 1, "place": 8, "texture": BANDS * 3}
 
 
 class Judged:
-    """A hypothesis with what all critics need: the state, and the dense columns that are free."""
+    """A hypothesis with what all critics need: the state, and the dense columns that are free.
 
-    def __init__(self, found: Hypothesis, index: FloatArray, noncentral: float) -> None:
+    ``block``: columns that are known within a unit of theirs.
+    """
+
+    def __init__(
+        self, found: Hypothesis, index: FloatArray, noncentral: float, block: Columns | None = None
+    ) -> None:
         point = found.point
         self.found, self.index, self.noncentral = found, index, noncentral
         self.geometry: ImageGeometry = point.problem.forward.geometry
         columns = point.level_columns
         if found.items:
             columns = joined(columns, effect_columns(point, found.items))
+        free = len(columns.value)
+        if block is not None:
+            columns = joined(columns, block)
         self.columns: Columns = columns
-        self.state = state_of(point, columns)
+        self.known = np.diag((np.arange(len(columns.value)) >= free).astype(float))  # precision of priors
+        self.state = state_of(point, columns, self.known)
 
     @property
     def rows(self) -> int:
@@ -61,8 +70,8 @@ class Judged:
     def family(self, values: FloatArray) -> tuple[float, int]:
         """Score statistic of further columns ``(L, W, N)``, all else free, and its degrees of freedom."""
         point = self.found.point
-        own = Columns(values, point._forward_solved(point._along(values)), np.zeros(len(values)))
-        base = point.information(self.columns, self.columns)
+        own = point.bare_columns(values)
+        base = point.information(self.columns, self.columns) + self.known
         across = np.linalg.solve(base, point.information(self.columns, own))
         matrix = point.information(own, own) - point.information(own, self.columns) @ across
         score = point.unbiased_score(own) - across.T @ point.unbiased_score(self.columns)
@@ -73,10 +82,13 @@ class Judged:
         return float((along**2 / size[keep]).sum()), int(keep.sum())
 
 
-def state_of(point: Point, columns: Columns) -> State:
-    """A point in the layout in which residuals are described and drawn."""
+def state_of(point: Point, columns: Columns, known: FloatArray | float = 0.0) -> State:
+    """A point in the layout in which residuals are described and drawn.
+
+    ``known`` (K, K): precision with which the dense parameters are known beforehand.
+    """
     shape = (len(point.levels), *point.problem.forward.geometry.sample_shape)
-    base = point.information(columns, columns)
+    base = point.information(columns, columns) + known
     step = np.linalg.solve(base, point.score(columns))
     left = point.projected(point.residual - np.tensordot(step, columns.value, axes=1))
     left = left / np.sqrt(np.maximum(point.noise_share, 0.05))
@@ -182,14 +194,22 @@ CRITICS: tuple[Critic, ...] = (_phase, _place, _texture, _spots, _trends)
 
 
 def judge(
-    found: Hypothesis, null: Hypothesis, index: FloatArray, rules: Rules, critics: Sequence[Critic] = CRITICS
+    found: Hypothesis,
+    null: Hypothesis,
+    index: FloatArray,
+    rules: Rules,
+    critics: Sequence[Critic] = CRITICS,
+    block: Columns | None = None,
 ) -> tuple[Channel, ...]:
-    """What all critics say of a hypothesis; fringes are described only so well, and effects in their form."""
+    """What all critics say of a hypothesis; fringes are described only so well, and effects in their form.
+
+    ``block``: see `Judged`.
+    """
     point = found.point
     fringes = point.response - point.response.mean(axis=1, keepdims=True)
     explained = max(null.chi2 - found.chi2, 0.0)
     noncentral = rules.precision**2 * float((fringes**2).sum()) + rules.imprecision**2 * explained
-    judged = Judged(found, index, noncentral)
+    judged = Judged(found, index, noncentral, block)
     return tuple(channel for critic in critics for channel in critic(judged))
 
 

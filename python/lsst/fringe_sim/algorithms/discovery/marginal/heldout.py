@@ -1,49 +1,164 @@
-"""The part held out, used once: whether effects that were fitted elsewhere predict it better."""
+"""The part held out, used once: effects that were fitted elsewhere must predict it, and better than a stand-in."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ...inference import Data, Hypothesis, Point, in_best_orders, relaxed
-from ..continuation import continued
+from ....errors import OutOfRangeError
+from ...inference import Hypothesis, Point, relaxed
+from ..learning import SIZES, Prior
+from ..verdict_words import LEARNED_WORDS
+from .lesson import (
+    CellPart,
+    data_of,
+    in_all_cells,
+    in_own_cells,
+    together,
+    unseen_too,
+    with_corrections,
+)
 from .preparation import Prepared
 
-__all__ = ["Unseen", "judge_unseen"]
+__all__ = ["StandIn", "Unseen", "judge_unseen", "stand_in"]
+
+FloatArray = NDArray[np.float64]
+
+ROUNDS = 3
+"""How often a stand-in is fitted again about itself, as long as that helps: what it does is hardly linear."""
+
+STRIDES = (1.0, 0.3, 0.1)
+"""Parts of the way to a fit that are tried."""
 
 
 @dataclass(frozen=True)
 class Unseen:
-    """Unchanged model against effects."""
+    """Unchanged model against effects, and against a stand-in of equal size."""
 
     gain: float  # of the log likelihood, with thickness and response of the cells free in both
     before_rms: float
     after_rms: float
+    stand_in: str = ""  # what it is; empty where none explains anything
+    stand_in_gain: float = 0.0
+
+    def why_not(self, outsider_prior: float) -> str:
+        """Why effects are not believed, or nothing.
+
+        A stand-in is a cause outside the catalogue that was written down. It is believed in their place where its
+        likelihood and its prior odds together are the larger.
+
+        ``outsider_prior``: prior probability of such a cause.
+        """
+        if self.gain <= 0.0:
+            return "data held out are not predicted better"
+        ahead = self.stand_in_gain - self.gain
+        if self.stand_in and ahead > math.log((1.0 - outsider_prior) / outsider_prior):
+            return (
+                f"{self.stand_in} with as many parameters predicts data held out better, by a log likelihood of "
+                f"{ahead:.1f}"
+            )
+        return ""
 
     @property
-    def better(self) -> bool:
-        """Whether the data are predicted better."""
-        return self.gain > 0.0
+    def text(self) -> str:
+        """One line for the notes."""
+        other = f", with {self.stand_in} of equal size by {self.stand_in_gain:.1f}" if self.stand_in else ""
+        return f"held out: the log likelihood rises by {self.gain:.1f}{other}"
 
 
 def judge_unseen(prepared: Prepared, found: Hypothesis) -> Unseen | None:
     """Compare a set with the unchanged model on the part held out; nothing where there is none."""
     if not prepared.unseen.seen.any():
         return None
-    before, after = (_fitted(prepared, one) for one in (prepared.null, found))
-    noise = prepared.unseen.noise_rms
-    number = max(float(before.noise_share[:, before.problem.data.seen].sum()), 1.0)
-    rms = [noise * float(np.sqrt(2.0 * point.cell_energy.sum() / number)) for point in (before, after)]
-    return Unseen(before.cost - after.cost, *rms)
+    noise, cells = prepared.unseen.noise_rms, together(prepared)
+    # All are judged with cells as the best thickness shapes them.
+    whole = in_all_cells(unseen_too(prepared, found.point, cells), cells)
+    before, after = (CellPart(_fitted(prepared, one.point, whole), noise) for one in (prepared.null, found))
+    told = Unseen(before.point.cost - after.point.cost, before.rms, after.rms)
+    rival = stand_in(CellPart(with_corrections(prepared.point), noise), len(found.items))
+    if rival is None:
+        return told
+    other = _fitted(prepared, rival.point, whole)
+    return replace(told, stand_in=rival.words, stand_in_gain=before.point.cost - other.cost)
 
 
-def _fitted(prepared: Prepared, found: Hypothesis) -> Point:
-    """The held out cells with the effects of a hypothesis as they are; levels and cells are their own."""
-    cells = prepared.unseen
-    shape = cells.shape
-    data = Data(cells.value.reshape(shape[0], -1), cells.weight.reshape(shape[0], -1))
-    start = continued(found.point.thickness_um.reshape(shape[1:]), prepared.cells.seen).ravel()
-    problem = replace(found.point.problem, data=data, thickness_um=start)
-    first = problem.at(found.point.settings, found.point.levels, start)
-    return relaxed(in_best_orders(relaxed(first, rounds=4)), rounds=6)
+def _fitted(prepared: Prepared, found: Point, whole: Point) -> Point:
+    """The held out cells with the effects of a point as they are; levels and cells are their own.
+
+    ``whole``: a point whose cells have their shape.
+    """
+    start = unseen_too(prepared, found, together(prepared)).thickness_um
+    forward = replace(found.problem.forward, shape=whole.problem.forward.shape)
+    problem = replace(found.problem, data=data_of(prepared.unseen), forward=forward, thickness_um=start)
+    return in_own_cells(problem.at(found.settings, found.levels, start))
+
+
+# Stand-in -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class StandIn:
+    """A correction with a given number of parameters, fitted to the part searched."""
+
+    words: str
+    point: Point
+
+
+def stand_in(part: CellPart, number: int) -> StandIn | None:
+    """The correction of so many parameters that explains the most, nothing where none explains anything.
+
+    The kinds of corrections are those that may be learned. Within a kind and a smoothness, the parameters are those
+    shapes that are independent in the data and before them, and the best of them are taken.
+
+    ``part``: the unchanged model. ``number``: parameters.
+    """
+    tried = [
+        (_best_shapes(prior, score[0], number), family, place)
+        for family, priors, score in zip(part.families, part.priors, part.scores(), strict=True)
+        for place, prior in enumerate(priors)
+    ]
+    (evidence, parameters), family, place = max(tried, key=lambda one: one[0][0])
+    known = np.zeros(len(parameters))
+    if evidence <= 0.0:
+        return None
+    for number_done in range(1, ROUNDS + 1):
+        new = _walked(part, family.keys, known, parameters)
+        if new is None:
+            break
+        known, part = new[0], CellPart(new[1], part.noise_rms, family.name)
+        if number_done < ROUNDS:
+            score = part.scores()[0][0] + part.information[0] @ known
+            _, parameters = _best_shapes(part.priors[0][place], score, number)
+    words = f"{LEARNED_WORDS[family.name]} ({family.priors[place][0]})"
+    return StandIn(words, part.point) if known.any() else None
+
+
+def _best_shapes(prior: Prior, score: FloatArray, number: int) -> tuple[float, FloatArray]:
+    """Log evidence of the best shapes of one prior, at its best size, and the parameters that they have."""
+    along, square = score @ prior.turn, SIZES[:, np.newaxis] ** 2
+    share = square / (1.0 + square * prior.known)
+    each = 0.5 * along**2 * share - 0.5 * np.log1p(square * prior.known)
+    best = np.sort(each, axis=1)[:, ::-1][:, :number].sum(axis=1)
+    size = int(best.argmax())
+    chosen = np.argsort(-each[size])[:number]
+    return float(best[size]), np.asarray(prior.turn[:, chosen] @ (along * share[size])[chosen])
+
+
+def _walked(
+    part: CellPart, keys: tuple[str, ...], known: FloatArray, wanted: FloatArray
+) -> tuple[FloatArray, Point] | None:
+    """Parameters on the way to others that describe the cells better, and the point there."""
+    point = part.point
+    for stride in STRIDES:
+        own = known + stride * (wanted - known)
+        settings = {**point.settings, **dict(zip(keys, own.tolist(), strict=True))}
+        try:
+            new = relaxed(point.moved(point.levels, point.thickness_um, settings), rounds=4)
+        except OutOfRangeError:
+            continue
+        if new.cost < point.cost:
+            return own, new
+    return None

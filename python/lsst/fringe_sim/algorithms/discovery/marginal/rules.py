@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 __all__ = ["Rules"]
@@ -76,3 +77,8 @@ class Rules:
     cell_phase: float = 3.5
     least_of_promise: float = 0.8
     sizes: tuple[float, ...] = (0.3, 1.0, 3.0)
+
+    @property
+    def sure(self) -> float:
+        """Log odds with which something is as probable as what is named."""
+        return math.log(self.least_probability / (1.0 - self.least_probability))

@@ -25,6 +25,7 @@ from ...inference import (
     jumped,
 )
 from ...inference.marginal import Point
+from .pace import Pace
 from .pairs import Joint
 from .rules import Rules
 from .scores import Scored, Scorer, best_gain, proposed
@@ -104,6 +105,7 @@ class SetSearch:
     say: Callable[[str], None]
     leaves_noise: Callable[[Hypothesis], bool]  # what the critics say
     pool: dict[frozenset[str], Hypothesis] = field(default_factory=dict)
+    pace: Pace = field(default_factory=Pace)
 
     def __post_init__(self) -> None:
         self.pool[frozenset()] = self.null
@@ -157,6 +159,10 @@ class SetSearch:
                 self._keep(self._fit(one.effects, one.items, at))
         return self._of_size(len(best.effects))[0]
 
+    def best_of(self, size: int) -> Hypothesis:
+        """The best set of so many effects that is known; there is one of every size below that of the best."""
+        return self._of_size(size)[0]
+
     def best_so_far(self) -> Hypothesis:
         """The best set that is known, none larger than what is surely better."""
         best = self.null
@@ -167,7 +173,7 @@ class SetSearch:
 
     def on(self, null: Hypothesis) -> SetSearch:
         """The same search of a problem that was judged again; the best sets are fitted from where they are."""
-        again = SetSearch(self.catalogue, null, self.rules, self.say, self.leaves_noise)
+        again = SetSearch(self.catalogue, null, self.rules, self.say, self.leaves_noise, pace=self.pace)
         known = sorted(self.pool.values(), key=self.posterior, reverse=True)
         top = known[0].log_evidence - self.null.log_evidence
         # With one effect of several the noise is still that of a wrong model.
@@ -188,8 +194,7 @@ class SetSearch:
 
     def _is_surely_better(self, larger: Hypothesis, smaller: Hypothesis) -> bool:
         """Whether a larger set is as probable beside a smaller one as what is named has to be."""
-        odds = self.rules.least_probability / (1.0 - self.rules.least_probability)
-        return self.posterior(larger) - self.posterior(smaller) > math.log(odds)
+        return self.posterior(larger) - self.posterior(smaller) > self.rules.sure
 
     def _is_enough(self, found: Hypothesis) -> bool:
         """Whether a set leaves noise, and no effect promises to be worth its price beside it."""
@@ -303,6 +308,7 @@ class SetSearch:
         if missing:
             number = min(number, self.rules.fewest_refits)
         found: dict[str, Hypothesis] = {}
+        self.pace.left = min(number, len(groups))
         for group in groups[:number]:
             if self._may_lead(base, group[0]) or len(found) < fewest:
                 found[group[0].name] = self._added(base, group[0])
@@ -312,6 +318,7 @@ class SetSearch:
         alike = {name for name, one in found.items() if self.posterior(one) > top - self.rules.class_width}
         for group in groups:
             names = {one.name for one in group}
+            self.pace.left = len(group)
             if alike & names or missing in names:
                 kept = self._kept(base, group)
                 for one in group:
@@ -377,14 +384,14 @@ class SetSearch:
         if step in self._added_before:
             return self.pool[frozenset(names)]
         items = self.catalogue.items[one.name]
-        if one.start is not None:
-            found = self._fit(names, (*base.items, *items), one.start)
-        else:
-            found = self._fitted(base, one, names, items)
+        with self.pace.fit():
+            if one.start is not None:
+                found = self._fit(names, (*base.items, *items), one.start)
+            else:
+                found = self._fitted(base, one, names, items)
         self._added_before.add(step)
-        self.say(
-            f"  {'+'.join(names)}: promised {one.gain:.1f}, brings {found.log_evidence - base.log_evidence:.1f}"
-        )
+        brought = f"promised {one.gain:.1f}, brings {found.log_evidence - base.log_evidence:.1f}"
+        self.say(f"  {'+'.join(names)}: {brought}{self.pace.text}")
         return self._keep(found)
 
     def _fitted(

@@ -3,36 +3,43 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any, cast
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from ....effects import Effect
 from ....model import FringeModel
 from ....products.fringe_cube import FringeCube
 from ...inference import Hypothesis
+from ...next_measurement import RankedMeasurement
 from ..channels import Channel
-from ..classes import outsider_probability
 from ..describe import describe_residual, disagreement
 from ..evaluations import OutOfTimeError, time_limit
-from ..verdict import CONFIDENCE, Gap, NamedEffect, ParameterValue, Step, Verdict, probability_text
-from .critics import judge, spots_instead, state_of, total_chance
+from ..learning import best_evidence, learn
+from ..neighbours import not_replaced
+from ..next_step import Values, with_next_measurements
+from ..options import SearchOptions
+from ..preparation import headers_apart
+from ..verdict import Gap, NamedEffect, Verdict
+from ..verdict_words import METRIC, WITHIN_ACCURACY, chance_text, said_of_left_out
+from .accuracy import told_accuracy
+from .critics import judge, state_of, total_chance
 from .heldout import Unseen, judge_unseen
+from .lesson import CellLesson, CellPart, with_corrections
+from .naming import Naming, name_effects
+from .next_flats import FlatForecast
 from .preparation import prepare, prepare_again
 from .rules import Rules
 from .search import Catalogue, SetSearch
 from .steps import told_of_steps
+from .telling import data_of, rms_left, size_of, steps_of
 
 __all__ = ["MarginalSearch"]
 
 FloatArray = NDArray[np.float64]
-
-_METRIC = "rms of data minus model, relative counts"
 
 
 class MarginalSearch:
@@ -47,18 +54,21 @@ class MarginalSearch:
         model: FringeModel,
         effects: Sequence[Effect],
         rng: np.random.Generator,
-        most_cells: int,
+        options: SearchOptions,
         report: Callable[[str], None],
     ) -> None:
-        rules = Rules()
+        shared = {field.name for field in fields(Rules)} & {field.name for field in fields(SearchOptions)}
+        # Both searches share what they call by one name, but for the cost of a round.
+        rules = Rules(**{name: getattr(options, name) for name in shared - {"refits"}})
         report("fitting the thickness with the unchanged model")
-        prepared = prepare(cube, model, effects, most_cells, rules, rng)
+        prepared = prepare(cube, model, effects, options.most_cells, rules, rng)
         self.prepared, self.model, self.rules, self.report = prepared, model, rules, report
+        self.options, self.rng, self.until = options, rng, math.inf
         stack = model.system.stack
         medium = stack.layers[stack.position(model.system.varying)].medium
         wavelength = prepared.cells.wavelength_nm
         self.index = np.real(medium.index(wavelength, model.system.temperature_k))
-        self.notes = ["searched by one likelihood (core marginal)"]
+        self.notes = [*headers_apart(cube, model), "searched by one likelihood (core marginal)"]
         self._judged_with: list[set[str]] = []
         self._judged: dict[tuple[Hypothesis, Hypothesis], tuple[Channel, ...]] = {}
         self.catalogue = Catalogue.of(effects, prepared.problem.forward, rules.most_effects)
@@ -73,48 +83,32 @@ class MarginalSearch:
             self._judged[key] = judge(*key, self.index, self.rules)
         return self._judged[key]
 
+    @property
+    def _chance(self) -> float:
+        """Chance that noise alone disagrees as much with the unchanged model."""
+        return total_chance(self._channels(self.prepared.null))
+
     def run(self) -> Verdict:
         """The answer."""
-        before = self._channels(self.prepared.null)
-        self.report(f"chance that noise alone disagrees as much: {total_chance(before):.3g}")
+        self.report(f"chance that noise alone disagrees as much: {self._chance:.3g}")
         best = self._best()
-        null, before = self.prepared.null, self._channels(self.prepared.null)
         if best.effects:
             return self._concluded(best)
-        if total_chance(before) > self.rules.significance:
-            self.notes += told_of_steps(self.sets, null, self.rules)
-            return self._told("no_discrepancy", null, before, (), {}, None)
-        return self._unexplained(null, ["no effect of the catalogue explains it"], (), None)
+        if self._chance > self.rules.significance:
+            self.notes += told_of_steps(self.sets, self.prepared.null, self.rules)
+            return self._told("no_discrepancy", self.prepared.null)
+        return self._unexplained(self.prepared.null, ["no effect of the catalogue explains it"])
 
     def best_so_far(self, until: float) -> Verdict:
         """Answer of a search that was stopped; the part held out is asked about it until an instant [s]."""
-        null, best = self.prepared.null, self.sets.best_so_far()
+        best, self.until = self.sets.best_so_far(), until
         if best.effects:
             try:
                 with time_limit(until):
                     return replace(self._concluded(best), complete=False)
             except OutOfTimeError:
                 self.notes.append(f"best so far, not judged on data held out: {', '.join(best.effects)}")
-        return replace(self._unexplained(null, ["the search was stopped"], (), None), complete=False)
-
-    def _concluded(self, best: Hypothesis) -> Verdict:
-        """Judgement of the set that was selected."""
-        best = self.sets.alike(best)
-        before, after = self._channels(self.prepared.null), self._channels(best)
-        unseen = judge_unseen(self.prepared, best)
-        named, doubts = self._named(best, total_chance(after))
-        reasons = []
-        if total_chance(after) < self.rules.significance:
-            worst, names = min(after, key=lambda channel: channel.probability), ", ".join(best.effects)
-            reasons.append(
-                f"with {names} a residual remains in '{worst.name}' (chance {worst.probability:.2g})"
-            )
-        reasons += [*self._at_ends(best), *doubts]
-        if unseen is not None and not unseen.better:
-            reasons.append("data held out are not predicted better")
-        if reasons:
-            return self._unexplained(best, reasons, named, unseen)
-        return self._told("named", best, before, named, {}, unseen)
+        return replace(self._unexplained(self.prepared.null, ["the search was stopped"]), complete=False)
 
     def _best(self) -> Hypothesis:
         """The best set, found one effect at a time; noise and cells are judged with the best of every size."""
@@ -144,6 +138,38 @@ class MarginalSearch:
         same = last is not None and len(last.effects) == len(best.effects)
         return same and best.log_evidence - last.log_evidence < self.rules.class_width
 
+    # Judgement --------------------------------------------------------------------------------------------------
+
+    def _concluded(self, best: Hypothesis) -> Verdict:
+        """Judgement of the set that was selected."""
+        best = self.sets.alike(best)
+        after = self._channels(best)
+        self.report(f"data held out are asked about {', '.join(best.effects)}")
+        unseen = judge_unseen(self.prepared, best)
+        explained = self.prepared.null.chi2 - best.chi2
+        naming = name_effects(self.sets, best, explained, total_chance(after))
+        reasons = []
+        if total_chance(after) < self.rules.significance:
+            worst, names = min(after, key=lambda channel: channel.probability), ", ".join(best.effects)
+            chance = chance_text(worst.probability)
+            reasons.append(f"with {names} a residual remains in '{worst.name}' (chance {chance})")
+        reasons += [*self._at_ends(best), *naming.doubts]
+        if unseen is not None:
+            self.notes.append(unseen.text)
+            reasons += [why] if (why := unseen.why_not(self.rules.outsider_prior)) else []
+        if reasons:
+            return self._unexplained(best, reasons, naming.effects, unseen)
+        form = self._what_may_be_form(best)
+        self.notes += form
+        decided, measurements = self._what_would_decide(best, naming)
+        found = self._told("named", best, decided, {}, unseen)
+        return replace(
+            found,
+            next_measurements=measurements,
+            accuracy=self._accuracy(best),
+            learned=self._learned(best) if form else {},
+        )
+
     def _at_ends(self, best: Hypothesis) -> list[str]:
         """Parameters at an end of their range that nature does not have."""
         found = []
@@ -153,149 +179,135 @@ class MarginalSearch:
                 found.append(f"{item.key} is at the end of its range ({value:g})")
         return found
 
-    # Classes --------------------------------------------------------------------------------------------------
+    def _what_may_be_form(self, best: Hypothesis) -> list[str]:
+        """That more than noise is left, though no more than what may be wrong with the form of the effects."""
+        exact = replace(self.rules, imprecision=0.0)
+        channels = judge(best, self.prepared.null, self.index, exact)
+        if total_chance(channels) > self.rules.significance:
+            return []
+        worst = min(channels, key=lambda channel: channel.probability)
+        told = (
+            f"less than {self.rules.imprecision:.0%} of what {', '.join(best.effects)} explains is left in "
+            f"'{worst.name}' (chance {chance_text(worst.probability)}): its form may be wrong by as much, or a "
+            "fainter effect be there"
+        )
+        alike = [one for one in self.sets.scores(best)[:1] if one.gain > 0.0]
+        return [told + "".join(f", most like {one.name} (gain {2.0 * one.gain:.0f})" for one in alike)]
 
-    def _named(self, best: Hypothesis, chance: float) -> tuple[tuple[NamedEffect, ...], list[str]]:
-        """Every effect of the best set with its class, and what is too doubtful."""
-        pool = list(self.sets.pool.values())
-        top = self.sets.posterior(best)
-        weights = np.exp(np.minimum([self.sets.posterior(one) - top for one in pool], 0.0))
-        explained = self.prepared.null.chi2 - best.chi2
-        like = cast(Any, SimpleNamespace(names=best.effects, probability_of_noise=chance))
-        without = {name: self.sets.without(best, name) for name in best.effects}
-        instead = spots_instead(best, without)
-        outsider = outsider_probability(like, self.rules.outsider_prior, explained, instead)
-        named, doubts = [], []
-        for name in best.effects:
-            members = self._class_of(best, name)
-            inside = np.array([bool(set(one.effects) & set(members)) for one in pool])
-            probability = float((weights * inside).sum() / weights.sum()) * (1.0 - outsider)
-            if probability < self.rules.least_probability:
-                doubts.append(f"the class of {name} has probability {probability_text(probability)} only")
-            others = tuple(sorted((one for one in members if one != name), key=lambda one: -members[one]))
-            named.append(
-                NamedEffect(
-                    name,
-                    self._parameters(best, name),
-                    probability,
-                    others,
-                    "further wavelengths; this search does not rank them yet" if others else "",
-                    members[name] / sum(members.values()),
-                    math.sqrt(max(without[name].chi2 - best.chi2, 0.0)),
-                )
-            )
-        return tuple(sorted(named, key=lambda one: -one.significance)), doubts
+    def _what_would_decide(
+        self, best: Hypothesis, naming: Naming
+    ) -> tuple[tuple[NamedEffect, ...], tuple[dict[str, Any], ...]]:
+        """Named effects with the flats that would decide between the members of their class."""
+        forecast = FlatForecast(best, self.model, self.prepared.cells)
 
-    def _class_of(self, best: Hypothesis, name: str) -> dict[str, float]:
-        """Weights of the effects that explain the data about as well in the place of one."""
-        rest = frozenset(best.effects) - {name}
-        top, members = best.log_evidence, {name: 1.0}
-        for names, one in self.sets.pool.items():
-            extra = names - rest
-            if rest < names and len(extra) == 1 and len(names) == len(best.effects):
-                behind = top - one.log_evidence
-                if behind < self.rules.class_width:
-                    members[next(iter(extra))] = math.exp(-max(behind, 0.0))
-        return members
+        def rank(effect: NamedEffect, rivals: Values) -> tuple[RankedMeasurement, ...]:
+            known: Mapping[str, Hypothesis] = naming.classes[effect.name].rivals
+            return forecast.ranked(effect.name, {name: known[name] for name in rivals})
 
-    @staticmethod
-    def _parameters(best: Hypothesis, name: str) -> dict[str, ParameterValue]:
-        sigma = np.sqrt(np.maximum(np.diag(best.covariance), 0.0))
-        return {
-            item.parameter: ParameterValue(float(value), float(error), item.unit)
-            for item, value, error in zip(best.items, best.values, sigma, strict=True)
-            if item.effect == name
-        }
+        values = {name: group.values for name, group in naming.classes.items()}
+        return with_next_measurements(naming.effects, values, rank, self.report)
 
-    # Layout ---------------------------------------------------------------------------------------------------
+    # Without a name -----------------------------------------------------------------------------------------------
+
+    def _alike(self, found: Hypothesis) -> Hypothesis:
+        """The effects of a set that are not the cause, and which no correction can replace."""
+
+        def evidence(one: Hypothesis) -> float:
+            return self.sets.posterior(one) + best_evidence(self._part(one))
+
+        def smaller(one: Hypothesis) -> list[Hypothesis]:
+            return [self.sets.without(one, name) for name in one.effects]
+
+        try:
+            with time_limit(self.until):
+                return not_replaced(found, smaller, evidence, self.rules.sure)
+        except OutOfTimeError:
+            return self.prepared.null
+
+    def _part(self, found: Hypothesis) -> CellPart:
+        return CellPart(with_corrections(found.point), self.prepared.cells.noise_rms)
+
+    def _learned(self, found: Hypothesis) -> dict[str, Any]:
+        """A correction beside a set, judged by cells that it has not seen; nothing where there is none."""
+        self.report("learning a correction from what is left")
+        least = self.rules.sure + self.catalogue.price  # what an effect must bring
+        try:
+            with time_limit(self.until):
+                learned = learn(CellLesson.of(self.prepared, found), self.rng, least)
+        except OutOfTimeError:
+            return {}
+        return {} if learned is None else learned.as_mapping(found.effects)
+
+    def _accuracy(self, found: Hypothesis) -> dict[str, Any]:
+        """The disagreement beside what the model may be wrong by."""
+        assumed = self.options.model_accuracy
+        if assumed == 0.0:
+            return {}
+        try:
+            with time_limit(self.until):
+                return told_accuracy(self.prepared.null, found, self.index, self.rules, assumed, self._chance)
+        except OutOfTimeError:
+            return {"assumed": assumed}
+
+    # Layout -------------------------------------------------------------------------------------------------------
 
     def _unexplained(
         self,
         found: Hypothesis,
         reasons: Sequence[str],
-        partial: Sequence[NamedEffect],
-        unseen: Unseen | None,
+        partial: Sequence[NamedEffect] = (),
+        unseen: Unseen | None = None,
     ) -> Verdict:
+        accuracy = self._accuracy(found)
+        # A search that was stopped says nothing of what it did not try, and what an effect explains is no error of a
+        # table.
+        ended = math.isinf(self.until) and not partial
+        within = ended and accuracy.get("chance", 0.0) > self.rules.significance
+        # What fails on data held out is like nothing.
+        fails = unseen is not None and unseen.gain <= 0.0
+        alike = self.prepared.null if within or fails else self._alike(found)
         state = state_of(found.point, found.point.level_columns)
         cells = self.prepared.cells
-        channels = self._channels(found)
         description = {
-            "reason": "; ".join(reasons),
+            "reason": "; ".join([*([WITHIN_ACCURACY] if within else []), *reasons]),
             "too_poor": False,
+            "like": list(alike.effects),
             "partial": [
                 {"name": e.name, "probability": e.probability, "significance": e.significance,
                  "parameters": {k: [p.value, p.sigma] for k, p in e.parameters.items()}}
                 for e in partial
             ],
-            **describe_residual(state, cells.geometry, self.index, cells.cell_px, channels),
+            **describe_residual(state, cells.geometry, self.index, cells.cell_px, self._channels(found)),
         }  # fmt: skip
-        before = self._channels(self.prepared.null)
-        return self._told("unexplained", found, before, (), description, unseen)
+        told = self._told("no_discrepancy" if within else "unexplained", found, (), description, unseen)
+        learned = {} if within else self._learned(alike)
+        return replace(told, learned=learned, accuracy={**accuracy, "within": within})
 
     def _told(
         self,
         word: str,
         found: Hypothesis,
-        before: tuple[Channel, ...],
-        effects: tuple[NamedEffect, ...],
-        unexplained: dict[str, Any],
-        unseen: Unseen | None,
+        effects: tuple[NamedEffect, ...] = (),
+        unexplained: dict[str, Any] | None = None,
+        unseen: Unseen | None = None,
     ) -> Verdict:
-        null, cells = self.prepared.null, self.prepared.cells
+        prepared, cells = self.prepared, self.prepared.cells
+        null, before = prepared.null, self._channels(prepared.null)
         state = state_of(null.point, null.point.level_columns)
-        first, last = self._rms(null), self._rms(found)
+        first, last = rms_left(prepared, null), rms_left(prepared, found)
         outside = (first, last) if unseen is None else (unseen.before_rms, unseen.after_rms)
-        steps: tuple[Step, ...] = ()
-        if found.effects:
-            gained = found.log_evidence - null.log_evidence
-            quiet = word == "named"
-            steps = (Step(found.effects, gained, null.chi2 - found.chi2, first, last, quiet),)
-        notes = self.notes + [f"{name} was left out: {why}" for name, why in self.catalogue.left_out.items()]
-        scored = self.sets.scores(null)
+        scores = [
+            {"name": one.name, "score": 2.0 * one.gain, "degrees": one.degrees}
+            for one in self.sets.scores(null)
+        ]
+        rounds = [self.sets.best_of(size) for size in range(1, len(found.effects))]
+        steps = steps_of(prepared, [*rounds, found] if found.effects else [], self._leaves_noise)
         return Verdict(
             word, effects,
             disagreement(state, before, cells.geometry, self.index, cells.cell_px),
-            Gap(_METRIC, first, last, *outside, cells.noise_rms),
-            steps, unexplained, self.model.setup.name, total_chance(before),
-            tuple({"name": one.name, "score": 2.0 * one.gain, "degrees": one.degrees} for one in scored),
-            (), tuple(notes), self._data(found), size=self._size(null),
+            Gap(METRIC, first, last, *outside, cells.noise_rms),
+            steps, unexplained or {}, self.model.setup.name, total_chance(before),
+            tuple(scores),
+            (), (*self.notes, *said_of_left_out(self.catalogue.left_out)), data_of(prepared, found),
+            size=size_of(prepared),
         )  # fmt: skip
-
-    def _data(self, found: Hypothesis) -> dict[str, Any]:
-        cells, thickness = self.prepared.cells, found.point.thickness_um
-        return {
-            "shape": list(cells.shape),
-            "cell_px": cells.cell_px,
-            "wavelength_nm": cells.wavelength_nm.tolist(),
-            "noise_factor": self.prepared.noise_factor.tolist(),
-            "response_scatter": cells.response_scatter,
-            "thickness_um": [float(thickness.min()), float(thickness.max())],
-        }
-
-    def _chi2(self, found: Hypothesis) -> tuple[float, float]:
-        """Chi square beside all that is free, and its degrees of freedom."""
-        point = found.point
-        seen = point.problem.data.seen
-        left = point.projected(point.residual)[:, seen]
-        free = len(point.levels) + len(found.items)
-        return float((left**2).sum()), float(point.noise_share[:, seen].sum()) - free
-
-    def _rms(self, found: Hypothesis) -> float:
-        chi2, degrees = self._chi2(found)
-        return self.prepared.cells.noise_rms * math.sqrt(chi2 / degrees)
-
-    def _size(self, null: Hypothesis) -> dict[str, float]:
-        """Size of what the unchanged model leaves beyond noise."""
-        chi2, degrees = self._chi2(null)
-        noise = self.prepared.cells.noise_rms
-        counts, most = (
-            noise * math.sqrt(max(chi2 / expected - 1.0, 0.0))
-            for expected in (degrees, float(chdtri(degrees, CONFIDENCE)))
-        )
-        pattern = null.point.value[:, null.point.problem.data.seen]
-        fringes = math.sqrt(float(pattern.var(axis=1).mean()))
-        return {
-            "of_counts": counts,
-            "of_fringes": counts / fringes,
-            "of_fringes_at_most": most / fringes,
-        }

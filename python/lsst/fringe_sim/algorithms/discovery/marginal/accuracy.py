@@ -1,0 +1,67 @@
+"""How well the model is known, in the likelihood of the cells: see `..accuracy` for the numbers."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...inference import Columns, Hypothesis, Point, effect_columns, joined
+from ..accuracy import ACCURACY_SOURCE, MODEL_ACCURACY, TABLE_STEP_NM
+from ..learned_columns import over_wavelength
+from .critics import CRITICS, judge, total_chance
+from .rules import Rules
+
+__all__ = ["evidence_within", "model_block", "told_accuracy"]
+
+FloatArray = NDArray[np.float64]
+
+
+def told_accuracy(
+    null: Hypothesis, best: Hypothesis, index: FloatArray, rules: Rules, accuracy: float, chance: float
+) -> dict[str, Any]:
+    """What the model may be wrong by, and what is left to explain then, as `Verdict.accuracy` holds it.
+
+    ``null``, ``best``: the unchanged model and the best set. ``accuracy``: see `MODEL_ACCURACY`. ``chance``: that
+    noise alone disagrees as much.
+    """
+    block = model_block(null.point, accuracy)
+    channels = judge(null, null, index, rules, CRITICS, block)
+    told: dict[str, Any] = {
+        "assumed": accuracy,
+        "source": ACCURACY_SOURCE if accuracy == MODEL_ACCURACY else "as asked for",
+        "chance": max(chance, total_chance(channels)),
+    }
+    if best.effects:
+        exact = best.log_evidence - null.log_evidence
+        told["log_evidence"] = exact
+        told["log_evidence_within"] = (
+            exact + evidence_within(best, accuracy) - evidence_within(null, accuracy)
+        )
+    return told
+
+
+def model_block(point: Point, accuracy: float) -> Columns:
+    """Errors of amplitude and phase of the fringes at all wavelengths, as columns of unit variance."""
+    forward = point.problem.forward
+    wavelength = forward.geometry.wavelength_nm
+    root = accuracy * over_wavelength(wavelength, TABLE_STEP_NM)  # (W, R)
+    radian_um = forward.model.fringe_order_um(wavelength)[:, np.newaxis] / (2.0 * math.pi)
+    shapes = [point.whitened(point.value - 1.0), point.steep * radian_um]
+    values = np.concatenate([root.T[:, :, np.newaxis] * shape for shape in shapes])
+    return point.bare_columns(values)
+
+
+def evidence_within(found: Hypothesis, accuracy: float) -> float:
+    """What the log evidence of a set gains where the model may be wrong by so much."""
+    point, columns = found.point, found.point.level_columns
+    if found.items:
+        columns = joined(columns, effect_columns(point, found.items))
+    block = model_block(point, accuracy)
+    across = np.linalg.solve(point.information(columns, columns), point.information(columns, block))
+    known = point.information(block, block) - point.information(block, columns) @ across
+    score = point.unbiased_score(block) - across.T @ point.unbiased_score(columns)
+    total = np.eye(len(score)) + 0.5 * (known + known.T)
+    return 0.5 * float(score @ np.linalg.solve(total, score)) - 0.5 * float(np.linalg.slogdet(total)[1])

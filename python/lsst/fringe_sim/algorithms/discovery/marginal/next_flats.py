@@ -1,0 +1,168 @@
+"""Which further flats would tell effects apart that a search has left in one class, by its own likelihood.
+
+As for frames of the sky (`..next_frames`): further flats are of the same cells, with the thickness and the response
+that these have, and with levels of their own. What two effects do differently is taken between their fits, each at
+the thickness that suits it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....errors import InputError
+from ....model import FringeModel
+from ...inference import Data, Forward, Hypothesis, Point
+from ...next_measurement import (
+    FlatMeasurement,
+    FlatSeries,
+    PairForecast,
+    RankedMeasurement,
+    candidate_measurements,
+)
+from ..cells import CellData
+from ..next_frames import pair_of
+
+__all__ = ["FlatForecast"]
+
+FloatArray = NDArray[np.float64]
+
+MOST_CELLS = 4096
+"""Cells for which a forecast is made; of more, so many stand for all."""
+
+MARGIN_UM = 0.1
+"""Thickness beyond that of the cells which tables of further flats cover [µm]."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What some flats show of every cell that stands for the sensor."""
+
+    value: FloatArray  # (W, N)
+    slope: FloatArray
+    weight: FloatArray
+    asked: FloatArray  # (K, W, N): differences and derivatives
+
+
+@dataclass(frozen=True, eq=False)
+class FlatForecast:
+    """Information of flats that are there, and of flats that could be taken, about effects of a class."""
+
+    best: Hypothesis
+    model: FringeModel  # as it is known before the search
+    cells: CellData
+
+    def ranked(self, name: str, rivals: Mapping[str, Hypothesis]) -> tuple[RankedMeasurement, ...]:
+        """Flats by how well they would tell an effect from others, best first.
+
+        ``rivals``: the best set with another effect in its place, by that effect.
+        """
+        here = self._seen(self.best.point.problem.forward, None, name, rivals)
+        present = self._information([here])
+        found = []
+        for measurement in self._candidates():
+            try:
+                further = self._seen(self._forward(measurement.series), measurement.series, name, rivals)
+            except InputError:  # what the effects cannot be under these conditions
+                continue
+            after = self._information([here, further])
+            pairs, first = [], 1
+            for other, rival in rivals.items():
+                own = slice(first, first + 1 + len(rival.items))
+                first = own.stop
+                now, then = pair_of(present, own), pair_of(after, own)
+                pairs.append(PairForecast(name, other, now[0], then[0], now[1], then[1]))
+            pairs.sort(key=lambda pair: pair.separation_after)
+            found.append(RankedMeasurement(measurement, tuple(pairs)))
+        return tuple(sorted(found, key=lambda item: -item.separation))
+
+    def _candidates(self) -> tuple[FlatMeasurement, ...]:
+        geometry = self.cells.geometry
+        levels = geometry.level_e[np.isfinite(geometry.level_e) & (geometry.level_e > 0.0)]
+        times = geometry.dark_time_s.tolist()
+        known = {"level_e": float(levels.mean())} if levels.size else {}
+        return candidate_measurements(
+            self.model, self.cells.wavelength_nm.tolist(), **known,
+            dark_time_s=times if min(times) > 0.0 else (),
+        )  # fmt: skip
+
+    @property
+    def _order(self) -> NDArray[np.int64]:
+        """Cells that stand for all."""
+        seen = np.flatnonzero(self.best.point.problem.data.seen)
+        if len(seen) <= MOST_CELLS:
+            return seen
+        return seen[np.linspace(0, len(seen) - 1, MOST_CELLS).astype(int)]
+
+    def _forward(self, series: FlatSeries) -> Forward:
+        """Model of the cells under the conditions of further flats."""
+        forward, thickness = self.best.point.problem.forward, self.best.point.thickness_um
+        waves = np.array(series.wavelength_nm)
+        times = np.array(series.dark_time_s) if series.dark_time_s else np.zeros(len(waves))
+        geometry = replace(
+            forward.geometry,
+            wavelength_nm=waves,
+            level_e=np.full(len(waves), series.level_e),
+            dark_time_s=times,
+        )
+        reach = max(float(thickness.min()) - MARGIN_UM, 0.05), float(thickness.max()) + MARGIN_UM
+        model = series.conditions(self.model)
+        return Forward(model, forward.catalogue, geometry, forward.shape, reach)
+
+    def _seen(
+        self, forward: Forward, series: FlatSeries | None, name: str, rivals: Mapping[str, Hypothesis]
+    ) -> _Seen:
+        """What flats show; ``series``: conditions of further ones, none for those that are there."""
+        order, own = self._order, self.best.point
+        value, slope = forward.predict(self._under(series, own.settings), own.thickness_um)
+        rest = {key: x for key, x in own.settings.items() if key.partition(".")[0] != name}
+        asked = [value - forward.predict(self._under(series, rest), own.thickness_um)[0]]
+        for rival in rivals.values():
+            there, at = rival.point.thickness_um, rival.point.settings
+            other = forward.predict(self._under(series, at), there)[0]
+            asked.append(value - other)
+            for item in rival.items:
+                now = at.get(item.key, item.null)
+                step = item.difference(now)
+                moved = self._under(series, {**at, item.key: now + step})
+                asked.append((forward.predict(moved, there)[0] - other) / step)
+        if series is None:
+            weight = own.problem.data.weight[:, order] * own.levels[:, np.newaxis] ** 2
+        else:
+            weight = np.full((len(value), len(order)), series.level_e * self.cells.cell_px**2)
+        weight = weight * (own.problem.data.seen.sum() / len(order))
+        return _Seen(value[:, order], slope[:, order], weight, np.stack(asked)[:, :, order])
+
+    def _under(self, series: FlatSeries | None, settings: Mapping[str, float]) -> Mapping[str, float]:
+        """Settings under other conditions: those whose null a set-up states keep their ratio to it."""
+        if series is None:
+            return settings
+        forward = self.best.point.problem.forward
+        model = self.model.with_effects({**self.model.effect_settings, **settings}, forward.catalogue)
+        return {
+            f"{item.effect.name}.{key}": value
+            for item in series.conditions(model).effects
+            for key, value in item.values.items()
+        }
+
+    def _information(self, seen: list[_Seen]) -> FloatArray:
+        """Products of what is asked with one another, all that is free projected out."""
+        value, slope, weight = (
+            np.concatenate([getattr(one, name) for one in seen]) for name in ("value", "slope", "weight")
+        )
+        asked = np.concatenate([one.asked for one in seen], axis=1)
+        at = self.best.point.thickness_um[self._order]
+        data = Data(value, weight)
+        problem = replace(self.best.point.problem, data=data, thickness_um=at)
+        point = Point(problem, {}, np.ones(len(value)), at, value, slope)
+        columns = point.bare_columns(point.whitened(asked))
+        planes = np.arange(len(value))
+        own = np.zeros((len(value), *value.shape))
+        own[planes, planes] = point.response
+        levels = point.bare_columns(own)
+        across = point.information(levels, columns)
+        within = np.linalg.solve(point.information(levels, levels), across)
+        return np.asarray(point.information(columns, columns) - across.T @ within)

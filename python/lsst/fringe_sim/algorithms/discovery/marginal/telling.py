@@ -1,0 +1,84 @@
+"""Numbers of a verdict from the cells of a search: sizes, gaps, steps, data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ...inference import Hypothesis
+from ..validation import size_beyond
+from ..verdict import Step
+from .preparation import Prepared
+
+__all__ = ["data_of", "rms_left", "size_of", "steps_of"]
+
+
+def rms_left(prepared: Prepared, found: Hypothesis) -> float:
+    """Rms of data minus model of the part searched, corrected for the freedom of all that is fitted."""
+    point = found.point
+    return prepared.cells.noise_rms * point.misfit(len(point.levels) + len(found.items))
+
+
+def size_of(prepared: Prepared) -> dict[str, float]:
+    """Size of what the unchanged model leaves beyond noise, as `Verdict.size` states it."""
+    point = prepared.null.point
+    seen = point.problem.data.seen
+    return size_beyond(_noise_and_misfit(prepared), point.value[:, seen])
+
+
+def _noise_and_misfit(prepared: Prepared) -> list[tuple[float, float, float]]:
+    """Variance of a value by noise, χ² and degrees of freedom: of single exposures, and of what all of them share.
+
+    The thickness of every cell is taken out of both.
+    """
+    point, cells = prepared.null.point, prepared.cells
+    seen = point.problem.data.seen
+    response, steep, residual = (own[:, seen] for own in (point.response, point.steep, point.residual))
+    square = np.maximum((steep**2).sum(axis=0), 1e-300)
+    response, residual = (own - steep * ((steep * own).sum(axis=0) / square) for own in (response, residual))
+    length2 = (response**2).sum(axis=0)
+    along2 = (response * residual).sum(axis=0) ** 2 / length2
+    scatter2 = cells.response_scatter**2
+    shared = float((along2 / (1.0 + length2 * scatter2)).sum())
+    single = float((residual**2).sum() - along2.sum())
+    of_shared = float((1.0 / length2).mean())
+    freedom = float(np.count_nonzero(point.root) - 2 * response.shape[1] - len(point.levels))
+    return [
+        (cells.noise_rms**2 - scatter2 - of_shared, single, max(freedom, 1.0)),
+        (of_shared + scatter2, shared, float(response.shape[1])),
+    ]
+
+
+def steps_of(
+    prepared: Prepared, rounds: Sequence[Hypothesis], leaves_noise: Callable[[Hypothesis], bool]
+) -> tuple[Step, ...]:
+    """What every round of a search brought over the one before.
+
+    ``rounds``: the best set of every size, the last one chosen.
+    """
+    steps, before = [], prepared.null
+    for after in rounds:
+        added = tuple(name for name in after.effects if name not in before.effects)
+        steps.append(
+            Step(
+                added, after.log_evidence - before.log_evidence, before.chi2 - after.chi2,
+                rms_left(prepared, before), rms_left(prepared, after), leaves_noise(after),
+            )
+        )  # fmt: skip
+        before = after
+    return tuple(steps)
+
+
+def data_of(prepared: Prepared, found: Hypothesis) -> dict[str, Any]:
+    """The part searched, as `Verdict.data` holds it."""
+    cells, thickness = prepared.cells, found.point.thickness_um
+    return {
+        "shape": list(cells.shape),
+        "cell_px": cells.cell_px,
+        "wavelength_nm": cells.wavelength_nm.tolist(),
+        "noise_factor": prepared.noise_factor.tolist(),
+        "response_scatter": cells.response_scatter,
+        "thickness_um": [float(thickness.min()), float(thickness.max())],
+    }

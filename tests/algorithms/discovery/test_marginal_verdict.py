@@ -1,0 +1,196 @@
+"""What the search on one likelihood concludes: held-out data, a stand-in, the accuracy of the model, what is left."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover, search
+from lsst.fringe_sim.algorithms.discovery.marginal.accuracy import evidence_within, told_accuracy
+from lsst.fringe_sim.algorithms.discovery.marginal.heldout import Unseen, judge_unseen
+from lsst.fringe_sim.algorithms.discovery.marginal.pace import Pace
+from lsst.fringe_sim.algorithms.discovery.marginal.preparation import Prepared, prepare
+from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
+from lsst.fringe_sim.algorithms.discovery.marginal.telling import size_of
+from lsst.fringe_sim.algorithms.inference import Hypothesis, coordinates_of, fit
+from lsst.fringe_sim.effects import EFFECTS, Effect
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import FlatExposures, FringeCube
+
+WAVELENGTHS = np.linspace(880.0, 990.0, 8)
+SIDE = 32
+ELECTRONS = 20_000.0
+Y, X = np.mgrid[:SIDE, :SIDE] / SIDE
+PRIOR = Rules().outsider_prior
+
+
+def flats_of(effects: dict[str, float], contrast: np.ndarray | float = 1.0) -> np.ndarray:
+    """Expected electrons of a small sensor."""
+    thickness = 15.0 + 0.5 * X + 0.3 * Y**2 - 0.2 * X * Y
+    model = FringeModel.from_setup("ts8_e2v", effects)
+    flats = model.respond(model.system.flat_fields(WAVELENGTHS, 0.1), thickness, WAVELENGTHS)
+    mean = flats.mean(axis=(1, 2), keepdims=True)
+    return ELECTRONS * (1.0 + np.reshape(contrast, (-1, 1, 1)) * (flats / mean - 1.0))
+
+
+def cube_of(rng: np.random.Generator, flats: np.ndarray) -> FringeCube:
+    model = FringeModel.from_setup("ts8_e2v")
+    image = rng.poisson(flats).astype(np.float32)
+    rows = FlatExposures(
+        WAVELENGTHS, np.full(8, model.setup.bandwidth_fwhm_nm), np.full(8, model.base_system.temperature_k)
+    )
+    return FringeCube(image, np.maximum(image, 1.0), np.zeros(image.shape, np.int32), rows, "electron")
+
+
+def catalogue(*names: str) -> list[Effect]:
+    return [one for one in EFFECTS if one.name in names]
+
+
+def prepared_of(cube: FringeCube, *names: str) -> Prepared:
+    model = FringeModel.from_setup("ts8_e2v")
+    return prepare(cube, model, catalogue(*names), 20_000, Rules(), np.random.default_rng(5))
+
+
+def fitted(prepared: Prepared, name: str, **values: float) -> Hypothesis:
+    """An effect, fitted to the part searched."""
+    forward, point = prepared.problem.forward, prepared.point
+    items = coordinates_of(forward.effect_of(name), forward)
+    settings = {f"{name}.{key}": value for key, value in values.items()}
+    return fit((name,), items, point.moved(point.levels, point.thickness_um, settings))
+
+
+def verdict_of(cube: FringeCube, *names: str) -> Verdict:
+    options = SearchOptions(core="marginal")
+    return discover(cube, "ts8_e2v", catalogue(*names), rng=np.random.default_rng(5), options=options)
+
+
+# Data held out -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.rng("an effect in the part searched alone")
+def test_selection_does_not_see_an_effect_in_the_part_held_out(rng: np.random.Generator) -> None:
+    """With it there the effect has its name; without it the same choice is made, and refused."""
+    names = ("contrast_loss", "roughness", "vignetting")
+    hidden = {"contrast_loss.factor": 0.9}
+    state = rng.bit_generator.state
+    with_it = cube_of(rng, flats_of(hidden))
+    rng.bit_generator.state = state
+    without = cube_of(rng, flats_of({}))
+    held = prepared_of(with_it, *names).unseen.seen
+    assert 0.1 < held.mean() < 0.4
+    planted = replace(with_it, image=np.where(held, without.image, with_it.image))
+    everywhere, outside = verdict_of(with_it, *names), verdict_of(planted, *names)
+    assert everywhere.verdict == "named"
+    (found,) = everywhere.effects
+    assert "contrast_loss" in (found.name, *found.ambiguous_with)
+    assert everywhere.gap.heldout_after < everywhere.gap.heldout_before
+    assert outside.candidates == everywhere.candidates
+    assert outside.steps == everywhere.steps
+    assert outside.verdict == "unexplained"
+    assert "data held out are not predicted better" in outside.unexplained["reason"]
+    assert outside.unexplained["like"] == []
+
+
+@pytest.fixture(scope="module")
+def bright_stain() -> Prepared:
+    """A stain that catalogue effects explain a part of."""
+    rng = np.random.default_rng(12)
+    stain = 0.02 * np.exp(-((X - 0.4) ** 2 + (Y - 0.55) ** 2) / 0.08)
+    return prepared_of(cube_of(rng, flats_of({}) * (1.0 - stain)), "illumination", "vignetting")
+
+
+def test_a_stand_in_beats_an_effect_that_is_not_the_cause(bright_stain: Prepared) -> None:
+    """Light that falls off in a line takes off some of a stain, and a smooth shape of as many parameters more."""
+    found = fitted(bright_stain, "illumination")
+    unseen = judge_unseen(bright_stain, found)
+    assert unseen is not None
+    assert unseen.gain > 0.0
+    assert unseen.stand_in_gain > unseen.gain + 10.0
+    assert "pattern over the sensor" in unseen.why_not(PRIOR)
+
+
+@pytest.mark.rng("a stand-in loses")
+def test_a_stand_in_loses_against_the_cause(rng: np.random.Generator) -> None:
+    prepared = prepared_of(cube_of(rng, flats_of({"bandwidth.fwhm": 2.6})), "bandwidth")
+    unseen = judge_unseen(prepared, fitted(prepared, "bandwidth", fwhm=2.3))
+    assert unseen is not None
+    assert unseen.gain > unseen.stand_in_gain > 0.0
+    assert unseen.why_not(PRIOR) == ""
+    assert unseen.after_rms < unseen.before_rms
+
+
+def test_an_effect_wins_at_equal_likelihood() -> None:
+    """The prior odds of a cause outside the catalogue are against the stand-in."""
+    odds = np.log((1.0 - PRIOR) / PRIOR)
+    equal = Unseen(10.0, 1.0, 1.0, "a pattern", 10.0 + 0.99 * odds)
+    assert equal.why_not(PRIOR) == ""
+    assert "with as many parameters" in replace(equal, stand_in_gain=10.0 + 1.01 * odds).why_not(PRIOR)
+    assert Unseen(-0.1, 1.0, 1.0).why_not(PRIOR) == "data held out are not predicted better"
+
+
+# Accuracy of the model ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.rng("contrasts of a table")
+def test_errors_of_the_tables_are_within_the_accuracy_of_the_model(rng: np.random.Generator) -> None:
+    """Contrasts that are off by a percent, each by itself, are explained by that accuracy, and by none."""
+    contrast = 1.0 + 0.014 * rng.standard_normal(len(WAVELENGTHS))
+    cube = cube_of(rng, 100.0 * flats_of({}, contrast))
+    prepared = prepared_of(cube, "contrast_loss")
+    model = FringeModel.from_setup("ts8_e2v")
+    layer = model.system.stack.layers[model.system.stack.position(model.system.varying)]
+    index = np.real(layer.medium.index(WAVELENGTHS, model.system.temperature_k))
+    null, rules = prepared.null, Rules()
+    assert told_accuracy(null, null, index, rules, 1e-6, 0.0)["chance"] < 1e-9
+    assert told_accuracy(null, null, index, rules, 0.014, 0.0)["chance"] > rules.significance
+    # What a mean of these errors is, an effect need not be.
+    loss = fitted(prepared, "contrast_loss", factor=0.99)
+    told = told_accuracy(null, loss, index, rules, 0.014, 0.0)
+    assert told["log_evidence_within"] < rules.sure
+    assert told["log_evidence"] == loss.log_evidence - null.log_evidence
+    assert evidence_within(null, 1e-9) == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.rng("a pattern of all exposures has a size")
+def test_what_all_exposures_share_has_its_size(rng: np.random.Generator) -> None:
+    """A response that scatters takes it up, and must not hide it."""
+    pattern = 0.02 * np.sign(np.sin(40.0 * np.pi * X))
+    scatter = 0.005 * rng.standard_normal(X.shape)
+    prepared = prepared_of(cube_of(rng, flats_of({}) * (1.0 + scatter)), "vignetting")
+    assert size_of(prepared)["of_counts"] < 0.003
+    null = prepared.null.point
+    value = prepared.cells.value * (1.0 + pattern)
+    data = replace(null.problem.data, value=value.reshape(len(value), -1))
+    changed = replace(prepared, null=fit((), (), null.problem_with(data)))
+    assert size_of(changed)["of_counts"] == pytest.approx(0.02, rel=0.1)
+
+
+# What is left to others --------------------------------------------------------------------------------------
+
+
+@pytest.mark.rng("another core answers")
+def test_what_the_present_search_answers_is_said(rng: np.random.Generator) -> None:
+    cube = cube_of(rng, flats_of({}))
+    assert search._why_not_marginal(cube, None) == ""
+    small = replace(cube, image=cube.image[:, :20], variance=cube.variance[:, :20], mask=cube.mask[:, :20])
+    assert "24 rows" in search._why_not_marginal(small, None)
+    known = np.full((SIDE, SIDE), 15.0, np.float32)
+    assert "known" in search._why_not_marginal(replace(cube, thickness=known, layer="adhesive"), None)
+    told = verdict_of(small, "vignetting")
+    assert any("the present search answers" in note for note in told.notes)
+
+
+def test_a_round_tells_what_it_takes_still(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = {"now": 0.0}
+    monkeypatch.setattr("time.monotonic", lambda: clock["now"])
+    pace = Pace()
+    pace.left = 3
+    with pace.fit():
+        clock["now"] = 2.0
+    assert pace.text == "; at most 2 more in this round, about 4 s"
+    for _ in range(3):
+        with pace.fit():
+            pass
+    assert pace.text == ""
