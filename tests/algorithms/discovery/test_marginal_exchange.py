@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.algorithms.discovery.marginal import verdict
+from lsst.fringe_sim.algorithms.discovery.marginal.naming import name_effects
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
 from lsst.fringe_sim.algorithms.discovery.marginal.scores import Scorer, best_gain
 from lsst.fringe_sim.algorithms.discovery.marginal.search import Catalogue, SetSearch
@@ -102,17 +102,12 @@ def test_one_cause_outside_the_catalogue_in_the_place_of_three_effects_leaves_th
         )  # fmt: skip
 
     best = found(names, 0.0)
-    own = SimpleNamespace(
-        sets=SimpleNamespace(
-            pool={frozenset(names): best},
-            posterior=lambda one: one.log_evidence,
-            without=lambda one, name: found(tuple(n for n in one.effects if n != name), 1e5),
-        ),
-        prepared=SimpleNamespace(null=found((), 1e6)),
+    sets = SimpleNamespace(
+        pool={frozenset(names): best},
+        posterior=lambda one: one.log_evidence,
+        without=lambda one, name: found(tuple(n for n in one.effects if n != name), 1e5),
         rules=Rules(),
-        _class_of=lambda best, name: {name: 1.0},
-        _parameters=lambda best, name: {},
     )
-    told, doubts = verdict.MarginalSearch._named(own, best, 0.5)  # type: ignore[arg-type]
-    assert len(told) == number
-    assert (not doubts) == named
+    naming = name_effects(sets, best, 1e6, 0.5)  # type: ignore[arg-type]
+    assert len(naming.effects) == number
+    assert (not naming.doubts) == named
