@@ -237,25 +237,29 @@ def fit(
     *,
     rounds: int = 12,
     aim: float = math.inf,
+    tolerance: float = LEAST_GAIN,
 ) -> Hypothesis:
     """The best parameters, levels and thickness from a start, by steps that lower the cost.
 
     Cells may go back to the first thickness: on the way from other effects some are left in other minima. ``aim``:
-    cost that others have reached; a fit that is far behind ends when its steps are short beside what it lacks.
+    cost that others have reached; a fit that is far behind ends when its steps are short beside what it lacks, and
+    any fit when a step gains less than ``tolerance``.
     """
-    point = _walked(items, _started(items, start), rounds, aim)
+    point = _walked(items, _started(items, start), rounds, aim, tolerance)
     back = _in_best_minima(point, [point.problem.thickness_um])
-    if point.cost - back.cost > _tolerance(back, aim):
-        point = _walked(items, back, rounds, aim)
+    if point.cost - back.cost > _tolerance(back, aim, tolerance):
+        point = _walked(items, back, rounds, aim, tolerance)
     return _hypothesis(effects, items, point)
 
 
-def _tolerance(point: Point, aim: float) -> float:
+def _tolerance(point: Point, aim: float, least: float) -> float:
     """Gain of a step with which a fit ends."""
-    return max(LEAST_GAIN, LEAST_PART * (point.cost - aim))
+    return max(least, LEAST_PART * (point.cost - aim))
 
 
-def _walked(items: Sequence[Coordinate], point: Point, rounds: int, aim: float) -> Point:
+def _walked(
+    items: Sequence[Coordinate], point: Point, rounds: int, aim: float, least: float
+) -> Point:
     """The same without going back."""
     for _ in range(rounds):
         columns = point.level_columns
@@ -266,7 +270,7 @@ def _walked(items: Sequence[Coordinate], point: Point, rounds: int, aim: float) 
         if new is None:
             break
         gain, point = _target(point, items) - _target(new, items), new
-        if gain < _tolerance(point, aim):
+        if gain < _tolerance(point, aim, least):
             break
     return point
 
