@@ -232,6 +232,14 @@ def test_a_frame_that_differs_in_one_part_is_another(place: float, butler: Butle
     report = ingest_raws(butler, [str(raw)], transfer="copy")
     assert (len(report.ingested), len(report.present)) == (0, 0)
     assert len(report.refused) == 1
+    raw.write_bytes(path.read_bytes() + bytes(2880))
+    assert len(ingest_raws(butler, [str(raw)], transfer="copy").refused) == 1
+
+
+def test_headers_that_are_of_no_instrument() -> None:
+    for translator in TRANSLATORS.values():
+        for known in ({"INSTRUME": "other"}, {}):
+            assert not translator.can_translate(known)
 
 
 def test_where_an_instrument_is_not_registered(tmp_path: Path) -> None:

@@ -130,6 +130,35 @@ def test_few_bins_take_a_simpler_spline_or_are_refused(tmp_path: Path) -> None:
         drawn(tmp_path / "strict", values, UNDERSAMPLESTYLE=0)
 
 
+def test_a_column_of_few_bins_with_a_value(tmp_path: Path) -> None:
+    """It takes the spline that they allow, or is refused; one value is a constant."""
+    values = bins()
+    values[:4, 2] = np.nan
+    values[1:, 5] = np.nan
+    values[:, 7] = np.nan
+    down, across = centres(SHAPE[0], 7), centres(SHAPE[1], 9)
+    along = np.empty((SHAPE[0], 8))
+    kept = [0, 1, 2, 3, 4, 5, 6, 8]
+    for place, column in enumerate(kept):
+        few = {2: lambda x, y: CubicSpline(x, y, bc_type="natural"), 5: None}.get(column, Akima1DInterpolator)
+        along[:, place] = values[0, 5] if few is None else line(down, values[:, column], np.arange(70.0), few)
+    found = drawn(tmp_path, values)
+    for row in (0, 33, 69):
+        np.testing.assert_allclose(
+            found[row], line(across[kept], along[row], np.arange(95.0), Akima1DInterpolator), rtol=1e-9
+        )
+    (tmp_path / "strict").mkdir()
+    with pytest.raises(FrameFormatError, match="bins with a value is 3; allowed: 5 or more"):
+        drawn(tmp_path / "strict", values, UNDERSAMPLESTYLE=0)
+
+
+@pytest.mark.parametrize("style", [CONSTANT, LINEAR, AKIMA])
+def test_one_bin_is_a_constant(style: int, tmp_path: Path) -> None:
+    np.testing.assert_array_equal(
+        drawn(tmp_path, np.full((1, 1), 7.5), INTERPSTYLE=style), np.full(SHAPE, 7.5)
+    )
+
+
 def test_polynomial(tmp_path: Path) -> None:
     """A plane and its products of degree 2 come back as they are, whatever the number of bins."""
     down, across = centres(SHAPE[0], 7), centres(SHAPE[1], 9)
