@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import itertools
 import os
 import subprocess
@@ -82,6 +83,23 @@ def test_what_a_killed_writer_left_is_cleared_by_the_next(tmp_path: Path) -> Non
     assert len(list(tmp_path.glob(".one.txt.*"))) == 1
     write_whole(path, "whole")
     assert sorted(tmp_path.iterdir()) == sorted([path, other])
+
+
+def test_of_what_is_left_only_files_of_nobody_are_cleared(tmp_path: Path) -> None:
+    """Neither links, of which anybody may have set one, nor what a writer still holds, nor files of other names."""
+    path, target = tmp_path / "one.txt", tmp_path / "precious"
+    names = [".one.txt.0123456789ab.part", ".one.txt.00000000000f.part", ".one.txt.0123456789a.part"]
+    names += [".one.txt.0123456789ab.part2", "xone.txt.0123456789ab.part", ".one.txt.fedcba987654.part"]
+    for name in (*names[:5], target.name):
+        (tmp_path / name).write_text("left")
+    (tmp_path / names[5]).symlink_to(target)
+    with (tmp_path / names[1]).open() as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        write_whole(path, "whole")
+        assert {each.name for each in tmp_path.iterdir()} == {"one.txt", "precious", *names[1:]}
+    write_whole(path, "whole")
+    assert {each.name for each in tmp_path.iterdir()} == {"one.txt", "precious", *names[2:]}
+    assert target.read_text() == "left"
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace", "unlink"])

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import uuid
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import click
 import numpy as np
 import pytest
 from small_pages import verdict
@@ -26,9 +28,11 @@ from lsst.fringe_sim.cli import (
     sky_frames,
 )
 from lsst.fringe_sim.cli.lab_frames import LabSeries
+from lsst.fringe_sim.cli.parameters import LABORATORY, SKY
 from lsst.fringe_sim.errors import FringeSimError, InputError
 from lsst.fringe_sim.instrument.bandpass import Bandpass
 from lsst.fringe_sim.instrument.camera import Camera
+from lsst.fringe_sim.instrument.setup import setup_names
 from lsst.fringe_sim.model import FringeModel, Setup
 from lsst.fringe_sim.products import SensorSection
 from lsst.fringe_sim.products.observed_files import ObservedImage
@@ -256,3 +260,84 @@ def test_what_is_fitted_beside_the_fringes(tmp_path: Path) -> None:
     assert observed.Background(None, 100.0, None).of(image) is None
     with pytest.raises(InputError, match=r"a file named as the frame night/b\.fits"):
         beside.of(replace(image, path=Path("night") / "b.fits"))
+
+
+HELD: Any = None
+
+
+@pytest.mark.parametrize(
+    ("cards", "found"),
+    [
+        ({"CONTRAST": 0.5, "CONTRSIG": 0.1}, (0.5, 0.1)),
+        ({"CONTRAST": 0.0, "CONTRSIG": 0.0}, (0.0, 0.0)),
+        ({"CONTRAST": 1.0, "CONTRSIG": 0.1}, (1.0, 0.1)),
+        ({"CONTRAST": 0.5, "CONTRSIG": 0.0}, (0.5, 0.0)),
+        ({"CONTRAST": 1.0, "CONTRSIG": 0.0}, HELD),
+        ({"CONTRAST": 1.0}, HELD),
+        ({"CONTRSIG": 1.0}, HELD),
+        ({"CONTRAST": -0.1, "CONTRSIG": 0.1}, "refused"),
+        ({"CONTRAST": 0.1, "CONTRSIG": -0.1}, "refused"),
+        ({"CONTRAST": math.inf, "CONTRSIG": 0.1}, "refused"),
+        ({"CONTRAST": 0.1, "CONTRSIG": math.inf}, "refused"),
+        ({"CONTRAST": math.nan, "CONTRSIG": 0.1}, "refused"),
+    ],
+)
+def test_the_contrast_that_a_map_states(cards: dict[str, float], found: Any) -> None:
+    if found == "refused":
+        with pytest.raises(InputError, match=r"^a map: CONTRAST"):
+            sky.laboratory_contrast(cards, "a map")
+    else:
+        assert sky.laboratory_contrast(cards, "a map") == found
+
+
+@pytest.mark.parametrize("overwrite", [True, False])
+def test_a_file_that_is_to_be_written(overwrite: bool, tmp_path: Path) -> None:
+    there, new = tmp_path / "there", tmp_path / "new"
+    there.write_text("")
+    output.refuse_used_file("--ecsv", new, overwrite)
+    if overwrite:
+        output.refuse_used_file("--ecsv", there, overwrite)
+    else:
+        with pytest.raises(InputError, match="a new file; --overwrite replaces it"):
+            output.refuse_used_file("--ecsv", there, overwrite)
+    with pytest.raises(InputError, match="not something else" if overwrite else "a new file"):
+        output.refuse_used_file("--ecsv", tmp_path, overwrite)
+    with pytest.raises(InputError, match="a folder that is there"):
+        output.refuse_used_file("--ecsv", tmp_path / "nowhere" / "new", overwrite)
+
+
+def test_names_of_set_ups_are_completed() -> None:
+    """Those of the kind of the command; files where there is none of that beginning."""
+    asked = click.Context(click.Command("x")), click.Option(["--setup"])
+    for kind, wanted in (("monochromator", LABORATORY), ("sky", SKY)):
+        names = [name for name in setup_names() if Setup.from_name(name).kind == kind]
+        assert 0 < len(names) < len(setup_names())
+        assert [item.value for item in wanted.shell_complete(*asked, "")] == names
+        first = [name for name in names if name.startswith(names[0][:2])]
+        assert [item.value for item in wanted.shell_complete(*asked, names[0][:2])] == first
+        (item,) = wanted.shell_complete(*asked, "no_such")
+        assert (item.value, item.type) == ("no_such", "file")
+
+
+@pytest.mark.parametrize(
+    ("limits", "top", "said"),
+    [
+        (
+            [14.0, 14.04],
+            30.0,
+            "steps are below the Nyquist rate for layers thicker than 14.0 µm, by wavelength",
+        ),
+        ([14.0, 14.06], 14.01, "steps are below the Nyquist rate for layers thicker than 14.0 to 14.1 µm"),
+        ([15.0, 14.0, 14.5], 14.0, "steps are above the Nyquist rate up to 14.0 to 15.0 µm"),
+        ([], 30.0, ""),
+    ],
+)
+def test_where_steps_are_too_wide(limits: list[float], top: float, said: str, capsys) -> None:
+    plan_flats._print_nyquist(np.array(limits), (5.0, top))
+    assert capsys.readouterr().out.startswith(said)
+
+
+def test_a_key_that_is_stated_twice_is_named() -> None:
+    assert provenance._each_key_once([("a", 1), ("b", 2)]) == {"a": 1, "b": 2}
+    with pytest.raises(InputError, match="key is 'b'; allowed: a key once"):
+        provenance._each_key_once([("a", 1), ("b", 2), ("c", 2), ("b", 3)])
