@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lsst.fringe_sim.errors import OutOfRangeError
 from lsst.fringe_sim.instrument.camera import Camera
+from lsst.fringe_sim.instrument.night import NightHistory
 from lsst.fringe_sim.model import Setup
 from lsst.fringe_sim.tasks import SkyFringeSimConfig, SkyFringeSimTask, sky_fringe_sim
 from lsst.fringe_sim.tasks.isr_flat_prep import IsrFlatPrepConfig, IsrFlatPrepConnections
@@ -99,3 +101,15 @@ def test_a_configuration_is_known_by_its_values() -> None:
     text = json.dumps(config.toDict(), sort_keys=True, default=str)
     assert config_digest(config) == hashlib.sha256(text.encode()).hexdigest()[:16]
     assert config_digest(config) != config_digest(SkyFringeSimConfig(seed=4))
+
+
+@pytest.mark.parametrize(("hour", "row"), [(0.0, 0), (-9e-7, 0), (5.0, 5), (10.0, 10), (10.0 + 9e-7, 10)])
+def test_both_ends_of_a_night_are_in_it(hour: float, row: int) -> None:
+    """The middle of an exposure is known to rounding only."""
+    night = NightHistory.guo2022()
+    (levels,) = sky_fringe_sim._at_hour(night, hour).intensity
+    np.testing.assert_allclose(levels, night.intensity[row], rtol=1e-5)
+    with pytest.raises(OutOfRangeError):
+        sky_fringe_sim._at_hour(night, -1.1e-6)
+    with pytest.raises(OutOfRangeError):
+        sky_fringe_sim._at_hour(night, 10.0 + 1.1e-6)
