@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from lsst.fringe_sim.files import all_or_nothing, same_file_key, write_together, write_whole
+from lsst.fringe_sim.files import all_or_nothing, json_text, same_file_key, write_together, write_whole
 
 
 def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
@@ -124,6 +124,10 @@ def test_files_of_two_writes_never_stand_beside_the_index(
     assert "index" not in found or len(set(found.values())) == 1
     write_together(tmp_path, dict.fromkeys(names, "newest"))
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == dict.fromkeys(names, "newest")
+
+
+def test_json_is_indented_for_people() -> None:
+    assert json_text({"a": [1, None]}) == '{\n  "a": [\n    1,\n    null\n  ]\n}'
 
 
 def test_a_folder_that_is_missing_is_said(tmp_path: Path) -> None:
