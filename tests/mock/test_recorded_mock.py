@@ -275,6 +275,22 @@ def test_a_beam_that_is_a_cone(hole: float) -> None:
         assert weight @ square**power == pytest.approx(mean, rel=1e-12)
 
 
+@pytest.mark.parametrize("yaw_deg", [0.0, 37.0, -90.0])
+def test_a_sensor_may_lie_turned_in_the_field(yaw_deg: float) -> None:
+    """Whole sensors of as many samples as one likes; its middle is at its place in the field."""
+    sensor = dataclasses.replace(Camera.from_name("lsstCam").detector("R02_S12"), yaw_deg=yaw_deg)
+    found = visits._field_radius_deg(sensor, (5, 3), 0.2)
+    y, x = (
+        (np.arange(n) - 0.5 * (n - 1)) / n * side * 0.2 / 3600.0
+        for n, side in zip((5, 3), sensor.shape, strict=True)
+    )
+    place = (x + 1j * y[:, np.newaxis]) * np.exp(1j * np.radians(yaw_deg))
+    np.testing.assert_allclose(
+        found, np.abs(complex(sensor.field_x_deg, sensor.field_y_deg) + place), rtol=1e-12
+    )
+    assert found[2, 1] == pytest.approx(sensor.field_radius_deg, rel=1e-12)
+
+
 @pytest.mark.parametrize(
     ("camera", "detector"), [("lsstCam", "R01_S00"), ("ts8", "R11_S01"), ("monocam", 0), ("hsc", 0)]
 )
