@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import itertools
 import os
 import subprocess
@@ -13,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from lsst.fringe_sim.files import all_or_nothing, same_file_key, write_together, write_whole
+from lsst.fringe_sim.files import all_or_nothing, json_text, same_file_key, write_together, write_whole
 
 
 def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
@@ -84,6 +85,23 @@ def test_what_a_killed_writer_left_is_cleared_by_the_next(tmp_path: Path) -> Non
     assert sorted(tmp_path.iterdir()) == sorted([path, other])
 
 
+def test_of_what_is_left_only_files_of_nobody_are_cleared(tmp_path: Path) -> None:
+    """Neither links, of which anybody may have set one, nor what a writer still holds, nor files of other names."""
+    path, target = tmp_path / "one.txt", tmp_path / "precious"
+    names = [".one.txt.0123456789ab.part", ".one.txt.00000000000f.part", ".one.txt.0123456789a.part"]
+    names += [".one.txt.0123456789ab.part2", "xone.txt.0123456789ab.part", ".one.txt.fedcba987654.part"]
+    for name in (*names[:5], target.name):
+        (tmp_path / name).write_text("left")
+    (tmp_path / names[5]).symlink_to(target)
+    with (tmp_path / names[1]).open() as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        write_whole(path, "whole")
+        assert {each.name for each in tmp_path.iterdir()} == {"one.txt", "precious", *names[1:]}
+    write_whole(path, "whole")
+    assert {each.name for each in tmp_path.iterdir()} == {"one.txt", "precious", *names[2:]}
+    assert target.read_text() == "left"
+
+
 @pytest.mark.parametrize("call", ["fsync", "replace", "unlink"])
 @pytest.mark.parametrize("number", range(7))
 def test_files_of_two_writes_never_stand_beside_the_index(
@@ -106,6 +124,10 @@ def test_files_of_two_writes_never_stand_beside_the_index(
     assert "index" not in found or len(set(found.values())) == 1
     write_together(tmp_path, dict.fromkeys(names, "newest"))
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == dict.fromkeys(names, "newest")
+
+
+def test_json_is_indented_for_people() -> None:
+    assert json_text({"a": [1, None]}) == '{\n  "a": [\n    1,\n    null\n  ]\n}'
 
 
 def test_a_folder_that_is_missing_is_said(tmp_path: Path) -> None:

@@ -7,11 +7,13 @@ import lzma
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from astropy.io import fits
 
+from lsst.fringe_sim import fits_gate
 from lsst.fringe_sim.errors import FrameFormatError
 from lsst.fringe_sim.resources import check_axes
 
@@ -135,3 +137,45 @@ def test_what_compress_has_packed_is_refused() -> None:
     with pytest.raises(FrameFormatError, match=r"\.Z"):
         check_axes(io.BytesIO(b"\x1f\x9d" + b"0" * 100), "somewhere")
     check_axes(io.BytesIO(b""), "somewhere")
+
+
+FIRST = "SIMPLE  =                    T"
+PLAIN = {"BITPIX": 16, "NAXIS": 2, "NAXIS1": 10, "NAXIS2": 20}
+TABLE = {"BITPIX": 8, "NAXIS": 2, "NAXIS1": 10, "NAXIS2": 20, "PCOUNT": 3000, "GCOUNT": 1}
+
+
+@pytest.mark.parametrize(
+    ("first", "cards", "size"),
+    [
+        (FIRST, PLAIN, 2880),
+        (FIRST, PLAIN | {"NAXIS2": 144}, 2880),
+        (FIRST, PLAIN | {"NAXIS2": 145}, 5760),
+        (FIRST, PLAIN | {"NAXIS2": 0}, 0),
+        (FIRST, {"BITPIX": 8, "NAXIS": 0}, 0),
+        (FIRST, {"BITPIX": -64, "NAXIS": 1, "NAXIS1": 361}, 5760),
+        ("XTENSION= 'BINTABLE'", TABLE, 5760),
+        ("XTENSION= 'BINTABLE'", TABLE | {"PCOUNT": 2680}, 2880),
+        ("XTENSION= 'BINTABLE'", TABLE | {"GCOUNT": 2, "BITPIX": 16}, 14400),
+        ("XTENSION= 'BINTABLE'", TABLE | {"PCOUNT": -201}, None),
+        ("XTENSION= 'BINTABLE'", TABLE | {"PCOUNT": -200}, 0),
+        ("SIMPLE  =                    F", PLAIN, None),
+        ("HISTORY", PLAIN, None),
+        (FIRST, {"NAXIS": 1, "NAXIS1": 10}, None),
+        (FIRST, {"BITPIX": 16, "NAXIS1": 10}, None),
+        (FIRST, {"BITPIX": 16, "NAXIS": 2, "NAXIS1": 10}, None),
+        (FIRST, PLAIN | {"NAXIS1": -1, "NAXIS2": -1}, None),
+        (FIRST, PLAIN | {"NAXIS2": "20.0"}, None),
+        (FIRST, PLAIN | {"GROUPS": "T"}, None),
+        (FIRST, PLAIN | {"naxis1": 10}, None),
+        (FIRST, {"BITPIX": 8, "NAXIS": 1, "NAXIS1": (1 << 40) - 1}, 1 << 40),
+        (FIRST, {"BITPIX": 8, "NAXIS": 1, "NAXIS1": 1 << 40}, None),
+        (FIRST, PLAIN | {"EXPTIME": "a"}, 2880),
+    ],
+)
+def test_what_a_header_says_of_the_size_of_its_data(
+    first: str, cards: dict[str, Any], size: int | None
+) -> None:
+    """In whole blocks of 2880 bytes; nothing where astropy may read it otherwise."""
+    lines = [first, *(f"{keyword:<8}= {value:>20} / note" for keyword, value in cards.items()), "END"]
+    expected = None if size is None else -(-size // 2880) * 2880
+    assert fits_gate._data_size("".join(f"{line:<80}" for line in lines).encode()) == expected

@@ -7,11 +7,13 @@ import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from lsst.fringe_sim import compiled
 from lsst.fringe_sim.cli.progress import progress
 from lsst.fringe_sim.compiled import kernel, limit_threads, processors, run_shares, run_threaded, subkernel
 from lsst.fringe_sim.descriptions import Description, files_of, is_file_name, with_files_beside
@@ -224,6 +226,70 @@ def test_only_what_asks_for_it_is_rounded_freely() -> None:
     for declared in (kernel, subkernel):
         assert not declared(lambda x: x).targetoptions["fastmath"]
         assert declared(lambda x: x, relaxed=True).targetoptions["fastmath"]
+
+
+def test_compiled_functions_work_where_none_can_be_kept(monkeypatch: pytest.MonkeyPatch, caplog) -> None:
+    """Each is compiled all the same, and it is said once; an error of another kind is not taken for that one."""
+    asked: list[bool] = []
+
+    def njit(cache: bool, **options: Any) -> Any:
+        asked.append(cache)
+        if cache:
+            raise RuntimeError("cannot cache")
+        return lambda function: function
+
+    monkeypatch.setattr(compiled.numba, "njit", njit)
+    monkeypatch.setattr(compiled, "_keep", [True])
+    for _ in range(2):
+        assert compiled.kernel(lambda x: x + 1.0)(2.0) == 3.0
+    assert asked == [True, False, False]
+    assert len(caplog.records) == 1
+
+    def broken(cache: bool, **options: Any) -> Any:
+        raise RuntimeError("no function")
+
+    monkeypatch.setattr(compiled.numba, "njit", broken)
+    with pytest.raises(RuntimeError, match="no function"):
+        compiled.kernel(lambda x: x)
+
+
+def test_what_cannot_be_kept_is_compiled_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog
+) -> None:
+    """Of a full disk and of a damaged file it is told once each."""
+    monkeypatch.setattr(compiled, "_said", set())
+
+    class Cache:
+        flushed = 0
+
+        def save_overload(self, signature: Any, data: Any) -> None:
+            raise OSError("no space left")
+
+        def load_overload(self, signature: Any, context: Any) -> None:
+            raise EOFError("half a file")
+
+        def flush(self) -> None:
+            Cache.flushed += 1
+
+    dispatchers = [SimpleNamespace(_cache=Cache()) for _ in range(2)]
+    for dispatcher in dispatchers:
+        compiled._work_without_cache(dispatcher, None)
+        dispatcher._cache.save_overload("signature", "data")
+        assert dispatcher._cache.load_overload("signature", "context") is None
+    assert len(caplog.records) == 2
+    assert Cache.flushed == 2
+    compiled._work_without_cache(SimpleNamespace(_cache=None), None)
+
+
+def test_only_a_folder_that_is_there_is_looked_into(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What an image keeps for all is read where it cannot be written; it is found by its place, or there is none."""
+    monkeypatch.setattr(compiled.numba.config, "CACHE_DIR", str(tmp_path))
+    assert compiled._kept_for_all(shown) is None
+    monkeypatch.setattr(compiled.os, "access", lambda *_: False)
+    assert compiled._kept_for_all(shown) is None
+    locator = compiled._cache_for_all()._impl_class._locator_classes[0]
+    (tmp_path / Path(locator(shown, shown.__code__.co_filename).get_cache_path()).name).mkdir()
+    assert compiled._kept_for_all(shown) is not None
 
 
 # At the prompt

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from click.shell_completion import BashComplete
+from recorded_numbers import Record, Words
 
 import lsst.fringe_sim
 from lsst.fringe_sim.cli.inputs import read_settings, sky_settings
@@ -48,6 +49,26 @@ def test_what_writes_can_be_tried_first(name: str) -> None:
 def test_every_option_is_explained(name: str) -> None:
     silent = [item.opts for item in command(name).params if isinstance(item, click.Option) and not item.help]
     assert silent == []
+
+
+TOLD = ("default", "is_eager", "multiple", "nargs", "required", "count")
+OF_TYPE = ("min", "max", "min_open", "max_open", "exists", "dir_okay", "choices")
+
+
+def facts(item: click.Parameter) -> str:
+    """What a parameter takes: its names, its bounds, whether a path has to exist, how often it may be given."""
+    values = {name: getattr(item, name, None) for name in TOLD}
+    values |= {name: getattr(item.type, name, None) for name in OF_TYPE}
+    plain = {
+        name: value
+        for name, value in values.items()
+        if value and isinstance(value, bool | int | float | str | tuple)
+    }
+    return " ".join([*item.opts, *(f"{name}={value}" for name, value in plain.items())])
+
+
+def test_what_commands_take_is_as_recorded(recorded: Record) -> None:
+    recorded([Words(facts(item) for item in command(name).params) for name in sorted(COMMANDS)])
 
 
 @pytest.mark.parametrize("name", sorted(name for name in COMMANDS if "--setup" in options(name)))

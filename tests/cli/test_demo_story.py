@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -71,7 +72,7 @@ def datasets(folder: Path) -> DemoDatasets:
     good, pattern = np.zeros((SIDE, SIDE), np.int32), waves(0.004).astype(float)
     return DemoDatasets(
         cube=FringeCube.from_arrays(counts, WAVELENGTHS_NM, variance=counts),
-        first_thickness=fitted,
+        first_thickness=replace(fitted, value=fitted.value + np.float32(3.0)),
         thickness=fitted,
         sky=tuple(sky((SIDE, SIDE), number, mask=good, hour=20.0 + number) for number in (1, 2)),
         template=frame((SIDE, SIDE), mask=good, image=pattern - pattern.mean()),

@@ -13,6 +13,7 @@ from astropy.table import Table
 from browser import check_page
 
 from lsst.fringe_sim.algorithms.cost_model import FocalPlaneCost
+from lsst.fringe_sim.cli import focal_plane
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.mock.thickness import e2v_321
 
@@ -85,6 +86,14 @@ def test_cost_grows_with_sensors_and_exposures() -> None:
 def test_bad_input_is_named(arguments, message, tmp_path, capsys) -> None:
     assert run(["focal-plane", *arguments, "--out", str(tmp_path / "out")]) == 1
     assert message in capsys.readouterr().err
+
+
+def test_effects_that_a_set_up_cannot_have_are_left_out(capsys) -> None:
+    settings = {"bandwidth.fwhm": 3.0, "silicon_absorption.scale": 1.1}
+    assert focal_plane._of_stack(settings, "lsst_itl") == {"silicon_absorption.scale": 1.1}
+    out, err = capsys.readouterr()
+    assert (out, len(err.splitlines())) == ("", 1)
+    assert err.startswith("lsst_itl: without bandwidth.fwhm (")
 
 
 def test_a_map_without_its_sensor_is_a_usage_error(tmp_path) -> None:

@@ -36,6 +36,20 @@ def test_unknown_command_is_a_usage_error_with_a_hint(capsys) -> None:
     assert "Did you mean effects?" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("word", "hint"),
+    [
+        ("template", " Did you mean templates or amplitudes?"),
+        ("sets", " Did you mean setups or effects?"),
+        ("setup", " Did you mean setups?"),
+        ("co", ""),
+    ],
+)
+def test_at_most_two_commands_are_proposed_and_only_near_ones(word: str, hint: str, capsys) -> None:
+    assert run([word]) == 2
+    assert f"There is no command '{word}'.{hint}\n" in capsys.readouterr().err
+
+
 def test_unknown_option_is_a_usage_error() -> None:
     assert run(["setups", "--nonsense"]) == 2
 

@@ -201,6 +201,19 @@ def test_compiling_does_every_piece_of_work(say: Say, monkeypatch) -> None:
     assert os.environ["NUMBA_CPU_NAME"] == "generic"
 
 
+def test_flats_are_simulated_while_compiling(monkeypatch) -> None:
+    """A bias frame and a flat of a few pixels."""
+    from lsst.fringe_sim.mock import raw_frames
+
+    made: list[Any] = []
+    write = raw_frames.write_mock_flats
+    monkeypatch.setattr(
+        raw_frames, "write_mock_flats", lambda *parts, **more: made.append(write(*parts, **more))
+    )
+    compile._simulated()
+    assert [len(run.paths) for run in made] == [2]
+
+
 FINDING = {"place": "Fig. 1", "quantity": "order", "unit": "nm", "stated": "3", "tolerance": 0.5}
 
 

@@ -141,6 +141,15 @@ def test_a_fit_of_a_cube(tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
         "would fit the layer adhesive to 8 flats",
     ]
     assert fits.getheader(tmp_path / "a" / "thickness.fits")["NFLATS"] == 8
+    silicon = ThicknessMap(value, zero, zero, zero, mask, "detection", detector="S1")
+    monkeypatch.setattr("lsst.fringe_sim.algorithms.thickness_fit.silicon_map", lambda *parts: silicon)
+    assert run(["fit", str(path), "--out", str(tmp_path / "both")]) == 0
+    assert capsys.readouterr().out.replace(str(tmp_path), "…").splitlines()[1:] == [
+        "…/both/thickness.fits",
+        "…/both/silicon.fits",
+        "…/both/report.html",
+    ]
+    assert ThicknessMap.read_fits(tmp_path / "both" / "silicon.fits").layer == "detection"
     masked = ThicknessMap(value, zero + 3.21e-3, zero + 1.0, zero, mask + 1, "adhesive", detector="S1")
     monkeypatch.setattr(
         "lsst.fringe_sim.algorithms.thickness_fit.fit_thickness", lambda *parts, **more: masked

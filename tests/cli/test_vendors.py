@@ -109,6 +109,18 @@ def test_the_name_of_a_sensor_tells_its_vendor_in_every_camera() -> None:
     assert Camera.from_name("hsc").vendor_of("R00_S00") == "Hamamatsu"
 
 
+def test_two_names_are_of_two_sensors_if_a_table_says_so() -> None:
+    """A number tells nothing, as each camera has one; nor does a name that no table has."""
+    camera = Camera.from_name("lsstCam")
+    serial = camera.detector("R22_S11").serial
+    assert camera.are_two_sensors("R22_S11", "R22_S12")
+    assert camera.are_two_sensors(f"{serial}-Dev", "R22_S12")
+    assert camera.are_two_sensors("RTM-020_S01", "RTM-020_S02")
+    for one in (serial, " R22_S11", "95", "unheard of"):
+        assert not camera.are_two_sensors("R22_S11", one)
+        assert not camera.are_two_sensors(one, "R22_S11")
+
+
 def test_a_map_of_the_silicon_that_names_a_sensor_of_the_other_vendor(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

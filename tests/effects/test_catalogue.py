@@ -85,6 +85,12 @@ def test_a_module_on_the_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         (OWN.format(name="bandwidth"), "no other effect"),
         (OWN.format(name="two words"), "identifier"),
         (OWN.format(name="delamination").replace('reference = "a test"', "pass"), "reference"),
+        (
+            OWN.format(name="delamination").replace(
+                'reference = "a test"', "reference = property(lambda effect: 1 / 0)"
+            ),
+            "reference",
+        ),
     ],
 )
 def test_what_is_no_catalogue_is_refused(tmp_path: Path, text: str, words: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -47,6 +48,11 @@ def test_in_exposures_of_one_length_it_is_a_pedestal_and_not_looked_for() -> Non
     with pytest.raises(InputError, match="dark_pedestal"):
         DARK_CURRENT.check_search(equal)
     DARK_CURRENT.check_search(geometry_of(SECONDS))
+    for ratio, refused in ((1.049, True), (1.051, False)):
+        times = np.full(len(SECONDS), 20.0)
+        times[1] *= ratio
+        with pytest.raises(InputError, match="different ones") if refused else nullcontext():
+            DARK_CURRENT.check_search(geometry_of(times))
 
 
 def test_exposures_must_state_their_length() -> None:

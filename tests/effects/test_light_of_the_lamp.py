@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,14 @@ import pytest
 from astropy.table import Table
 from scipy.integrate import quad
 
+from lsst.fringe_sim.effects import known_effects
 from lsst.fringe_sim.effects.light import xenon_lines
 from lsst.fringe_sim.effects.line_profiles import LorentzianProfile, MixedProfile, line_width
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.optics.illumination import (
     GaussianProfile,
+    LampSpectrum,
     MonochromaticProfile,
     TriangularProfile,
 )
@@ -94,6 +97,19 @@ def test_lamp_lines_pull_the_light_towards_them(base: FringeModel) -> None:
     assert shift[3] > 0.1  # 992.6 nm
     change = model.response(PHASES, waves) - base.response(PHASES, waves)
     assert np.abs(change[1]).max() < 0.05 * np.abs(change[0]).max()
+
+
+def test_lines_stand_on_the_spectrum_that_is_known(base: FringeModel) -> None:
+    """Where it is known, both ends included; without one they stand on even light."""
+    (effect,) = (each for each in known_effects() if each.name == "lamp_lines")
+    alone = effect.change_system(base.system, {"strength": 2.0}).lamp
+    wave = alone.wavelength_nm
+    known = LampSpectrum(wave[5:-7], np.linspace(3.0, 1.0, wave.size - 12))
+    both = effect.change_system(replace(base.system, lamp=known), {"strength": 2.0}).lamp
+    np.testing.assert_array_equal(both.wavelength_nm, known.wavelength_nm)
+    on_even, product = alone.at(known.wavelength_nm), both.at(known.wavelength_nm)
+    ratio = product / (on_even * known.at(known.wavelength_nm))
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-9)
 
 
 @pytest.mark.shared

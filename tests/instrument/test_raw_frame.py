@@ -231,6 +231,10 @@ REFUSED: dict[str, tuple[Callable[[fits.HDUList], Any], str]] = {
         set_in(3, "CHANNEL", "three"),
         r"CHANNEL is 'three'; allowed: an integer from 1 to 16",
     ),
+    "overscan in the image": (
+        set_in(3, "BIASSEC", "[15:20,12:20]"),
+        r"C12 BIASSEC is '\[15:20,12:20\]'; allowed: a section without pixels of DATASEC \[11:15,1:12\]",
+    ),
     "floating point": (as_float, r"C14 BITPIX is -32; .*integer ADU"),
 }
 
@@ -244,6 +248,16 @@ def test_what_is_wrong_with_a_layout_is_said_in_one_message(tmp_path: Path, case
             read(path)
         assert str(caught.value).startswith(str(path))
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("section", ["[16:20,1:12]", "[1:15,13:20]", "[1:10,1:12]"])
+def test_overscan_beside_or_above_the_image_is_none_of_it(tmp_path: Path, section: str) -> None:
+    detector = small_detector()
+    image = random_image(detector)
+    hdus = raw_hdus(image, detector)
+    set_in(3, "BIASSEC", section)(hdus)
+    hdus.writeto(tmp_path / "raw.fits")
+    np.testing.assert_array_equal(assembled(RawFrame.read(tmp_path / "raw.fits")), image)
 
 
 def test_gap_between_amplifiers_is_refused(tmp_path: Path) -> None:

@@ -139,6 +139,8 @@ def test_nights_that_are_drawn(recorded: Record) -> None:
     joined = join_nights([drawn, dataclasses.replace(drawn, hours=drawn.hours + 1.0)])
     assert len(joined) == 8
     recorded({"drawn": drawn, "several": several, "joined": joined})
+    with pytest.raises(InputError, match="nights is 0; allowed: one or more"):
+        join_nights([])
 
 
 def test_lines_and_levels(recorded: Record) -> None:

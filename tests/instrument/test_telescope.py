@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import batoid
 import numpy as np
@@ -12,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, ResourceError, UnknownNameError
-from lsst.fringe_sim.instrument.beam_field import BeamField
+from lsst.fringe_sim.instrument.beam_field import BeamField, _clear_radii
 from lsst.fringe_sim.instrument.telescope import (
     ConeOptics,
     Telescope,
@@ -260,3 +262,26 @@ def test_bad_input_is_named(lsst):
         TracedOptics("NoSuch.yaml", 1000.0, axisymmetric=True).trace(0.0, 0.0)
     with pytest.raises(OutOfRangeError, match="a place that light reaches"):
         COARSE.trace(2.5, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("stop", "radii"),
+    [
+        (None, (0.0, math.inf)),
+        (batoid.ObscNegation(batoid.ObscCircle(3.0)), (0.0, 3.0)),
+        (batoid.ObscNegation(batoid.ObscAnnulus(1.0, 3.0)), (1.0, 3.0)),
+        (batoid.ObscNegation(batoid.ObscCircle(3.0, 0.1)), None),
+        (batoid.ObscNegation(batoid.ObscAnnulus(1.0, 3.0, 0.0, 0.1)), None),
+        (batoid.ObscNegation(batoid.ObscCircle(3.0, 0.1, 0.1)), None),
+        (batoid.ObscCircle(3.0), None),
+        (batoid.ObscNegation(batoid.ObscRectangle(3.0, 2.0)), None),
+    ],
+)
+def test_what_a_surface_lets_through(stop: Any, radii: tuple[float, float] | None) -> None:
+    """Circles and annuli about the axis; other apertures are refused."""
+    surface: Any = SimpleNamespace(name="L1", obscuration=stop)
+    if radii is None:
+        with pytest.raises(ResourceError, match="aperture of L1"):
+            _clear_radii(surface)
+    else:
+        assert _clear_radii(surface) == radii

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from lsst.daf.butler import Butler, DatasetType
+from lsst.daf.butler import Butler, DatasetProvenance, DatasetType
 from product_makers import components, flat, frame, sky, thickness
 
 from lsst.fringe_sim.cli.demo_report import DemoDatasets, dataset_path
@@ -17,6 +17,7 @@ from lsst.fringe_sim.cli.discover import _from_repository
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.middleware.night import NightPlan, define_night
+from lsst.fringe_sim.model.provenance import input_cards
 
 pytestmark = pytest.mark.middleware
 
@@ -93,12 +94,21 @@ def test_products_of_a_demo(butler: Butler, exposures: list[int], repo: Path) ->
 
 
 def test_provenance_of_what_is_stored(
-    butler: Butler, exposures: list[int], repo: Path, capsys: pytest.CaptureFixture[str]
+    butler: Butler, exposures: list[int], repo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    put(butler, thickness(), "epoxyThickness", "u/a")
+    source = tmp_path / "source.txt"
+    source.write_text("a")
+    flats = put(butler, flat(), "fringeFlat", "u/a", exposure=exposures[0])
+    made = DatasetProvenance()
+    made.add_input(flats)
+    files = input_cards([source])
+    put(butler, thickness(metadata=files), "epoxyThickness", "u/a", provenance=made)
     asked = ["provenance", str(repo), "--dataset-type", "epoxyThickness"]
     assert run([*asked, "--collections", "u/a", "--json"]) == 0
     (record,) = json.loads(capsys.readouterr().out)
     assert record["file"].startswith("epoxyThickness {instrument: 'LSSTCam', detector: 94} in u/a")
+    place = {"instrument": "LSSTCam", "detector": 94, "exposure": exposures[0]}
+    assert [item.get("data id") for item in record["inputs"]] == [str(place), None]
+    assert [item.get("file") for item in record["inputs"]] == [None, "source.txt"]
     assert run([*asked, "--collections", "u/b"]) == 1
     assert "at least one epoxyThickness in u/b where all" in capsys.readouterr().err

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from astro_metadata_translator import ObservationInfo
-from lsst.daf.butler import Butler, DatasetType
+from lsst.daf.butler import Butler, ButlerConfig, DatasetType
+from lsst.resources import ResourcePath
 from product_makers import thickness
 from raw_frame_maker import LSSTCAM_HEADER, write_raw
 from toy_repository import Invoke, put_fringe
 
 from lsst.fringe_sim.instrument.raw_frame import read_raw_header
-from lsst.fringe_sim.middleware.instruments import INSTRUMENTS
+from lsst.fringe_sim.middleware import raw_ingest
+from lsst.fringe_sim.middleware.instruments import INSTRUMENTS, _warn_unprepared
 from lsst.fringe_sim.middleware.night import NightPlan, define_night
 from lsst.fringe_sim.middleware.raw_ingest import examine, ingest_raws
 from lsst.fringe_sim.middleware.translators import TRANSLATORS
@@ -232,6 +235,43 @@ def test_a_frame_that_differs_in_one_part_is_another(place: float, butler: Butle
     report = ingest_raws(butler, [str(raw)], transfer="copy")
     assert (len(report.ingested), len(report.present)) == (0, 0)
     assert len(report.refused) == 1
+    raw.write_bytes(path.read_bytes() + bytes(2880))
+    assert len(ingest_raws(butler, [str(raw)], transfer="copy").refused) == 1
+
+
+def test_blocks_that_are_compared_lie_evenly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the first byte to the last; what lies between two blocks is not looked at."""
+    monkeypatch.setattr(raw_ingest, "COMPARED_BLOCKS", 5)
+    monkeypatch.setattr(raw_ingest, "COMPARED_BYTES", 10)
+    stored, other = tmp_path / "stored", tmp_path / "other"
+    stored.write_bytes(bytes(1010))
+    for begin in (0, 250, 500, 750, 1000):
+        for place, same in ((begin, False), (begin + 9, False), (begin + 10, True)):
+            if place < 1010:
+                other.write_bytes(bytes(place) + b"x" + bytes(1009 - place))
+                assert raw_ingest._same_content(str(other), ResourcePath(str(stored))) is same
+    other.write_bytes(bytes(1011))
+    assert not raw_ingest._same_content(str(other), ResourcePath(str(stored)))
+
+
+def test_the_repository_that_lacks_something_is_named(tmp_path: Path, caplog) -> None:
+    """Where an instrument is registered; by its folder, if it is known."""
+    Butler.makeRepo(str(tmp_path / "bare"))
+    config = ButlerConfig(str(tmp_path / "bare"))
+    registry = SimpleNamespace(_butler=SimpleNamespace(_config=config))
+    _warn_unprepared(registry)
+    assert f"prepare-fringe-repo {tmp_path / 'bare'}" in caplog.records[-1].getMessage().replace("//", "/")
+    config.configFile = None
+    _warn_unprepared(registry)
+    assert "prepare-fringe-repo REPO" in caplog.records[-1].getMessage()
+    _warn_unprepared(SimpleNamespace())
+    assert len(caplog.records) == 2
+
+
+def test_headers_that_are_of_no_instrument() -> None:
+    for translator in TRANSLATORS.values():
+        for known in ({"INSTRUME": "other"}, {}):
+            assert not translator.can_translate(known)
 
 
 def test_where_an_instrument_is_not_registered(tmp_path: Path) -> None:

@@ -251,6 +251,47 @@ def test_readout_and_defects(recorded: Record) -> None:
 
 
 @pytest.mark.parametrize(
+    ("wavelength_nm", "seconds"),
+    [(None, 0.0), (700.0, 12.0), (800.0, 12.0), (960.0, 45.524), (1040.0, 88.669)],
+)
+def test_exposures_are_longer_where_lamp_and_sensor_fade(wavelength_nm: float | None, seconds: float) -> None:
+    """To a thousandth of a second, as headers have it; and forty seconds pass between two."""
+    clock = Clock(datetime.datetime(2018, 7, 24, 5, 0, 0))
+    start, length = clock.next(wavelength_nm)
+    assert length == seconds
+    assert (clock.next(None)[0] - start).total_seconds() == 40.0 + np.ceil(seconds)
+
+
+@pytest.mark.parametrize("hole", [0.0, 0.6])
+def test_a_beam_that_is_a_cone(hole: float) -> None:
+    """The pupil is uniform in the squared sine of the angle."""
+    stated = {"kind": "cone", "f_number": 2.0, **({"obscuration": hole} if hole else {})}
+    theta, weight = visits._angles(stated, 1.0, 6)
+    low, high = (0.25 * hole) ** 2, 0.25**2
+    square = np.sin(theta) ** 2
+    assert theta.size == 6
+    for power in range(4):
+        mean = (high ** (power + 1) - low ** (power + 1)) / ((power + 1) * (high - low))
+        assert weight @ square**power == pytest.approx(mean, rel=1e-12)
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 37.0, -90.0])
+def test_a_sensor_may_lie_turned_in_the_field(yaw_deg: float) -> None:
+    """Whole sensors of as many samples as one likes; its middle is at its place in the field."""
+    sensor = dataclasses.replace(Camera.from_name("lsstCam").detector("R02_S12"), yaw_deg=yaw_deg)
+    found = visits._field_radius_deg(sensor, (5, 3), 0.2)
+    y, x = (
+        (np.arange(n) - 0.5 * (n - 1)) / n * side * 0.2 / 3600.0
+        for n, side in zip((5, 3), sensor.shape, strict=True)
+    )
+    place = (x + 1j * y[:, np.newaxis]) * np.exp(1j * np.radians(yaw_deg))
+    np.testing.assert_allclose(
+        found, np.abs(complex(sensor.field_x_deg, sensor.field_y_deg) + place), rtol=1e-12
+    )
+    assert found[2, 1] == pytest.approx(sensor.field_radius_deg, rel=1e-12)
+
+
+@pytest.mark.parametrize(
     ("camera", "detector"), [("lsstCam", "R01_S00"), ("ts8", "R11_S01"), ("monocam", 0), ("hsc", 0)]
 )
 def test_frames_of_a_camera(camera: str, detector: str | int, tmp_path: Path, recorded: Record) -> None:

@@ -17,7 +17,7 @@ SHAPE = (70, 95)
 AKIMA, NATURAL, LINEAR, CONSTANT = 5, 2, 1, 0
 
 
-def write(path: Path, *backgrounds: np.ndarray, variance: float = 1.0, **cards: Any) -> Path:
+def write(path: Path, *backgrounds: np.ndarray, variance: Any = 1.0, **cards: Any) -> Path:
     """The layout of ``BackgroundList.writeFits``: three images each, keywords in all of them."""
     hdus: list[Any] = []
     for bins in backgrounds:
@@ -130,6 +130,35 @@ def test_few_bins_take_a_simpler_spline_or_are_refused(tmp_path: Path) -> None:
         drawn(tmp_path / "strict", values, UNDERSAMPLESTYLE=0)
 
 
+def test_a_column_of_few_bins_with_a_value(tmp_path: Path) -> None:
+    """It takes the spline that they allow, or is refused; one value is a constant."""
+    values = bins()
+    values[:4, 2] = np.nan
+    values[1:, 5] = np.nan
+    values[:, 7] = np.nan
+    down, across = centres(SHAPE[0], 7), centres(SHAPE[1], 9)
+    along = np.empty((SHAPE[0], 8))
+    kept = [0, 1, 2, 3, 4, 5, 6, 8]
+    for place, column in enumerate(kept):
+        few = {2: lambda x, y: CubicSpline(x, y, bc_type="natural"), 5: None}.get(column, Akima1DInterpolator)
+        along[:, place] = values[0, 5] if few is None else line(down, values[:, column], np.arange(70.0), few)
+    found = drawn(tmp_path, values)
+    for row in (0, 33, 69):
+        np.testing.assert_allclose(
+            found[row], line(across[kept], along[row], np.arange(95.0), Akima1DInterpolator), rtol=1e-9
+        )
+    (tmp_path / "strict").mkdir()
+    with pytest.raises(FrameFormatError, match="bins with a value is 3; allowed: 5 or more"):
+        drawn(tmp_path / "strict", values, UNDERSAMPLESTYLE=0)
+
+
+@pytest.mark.parametrize("style", [CONSTANT, LINEAR, AKIMA])
+def test_one_bin_is_a_constant(style: int, tmp_path: Path) -> None:
+    np.testing.assert_array_equal(
+        drawn(tmp_path, np.full((1, 1), 7.5), INTERPSTYLE=style), np.full(SHAPE, 7.5)
+    )
+
+
 def test_polynomial(tmp_path: Path) -> None:
     """A plane and its products of degree 2 come back as they are, whatever the number of bins."""
     down, across = centres(SHAPE[0], 7), centres(SHAPE[1], 9)
@@ -142,6 +171,45 @@ def test_polynomial(tmp_path: Path) -> None:
     found = drawn(tmp_path, values, APPROXSTYLE=0, APPROXORDERX=2, APPROXORDERY=2)
     true = plane(np.arange(SHAPE[0])[:, None], np.arange(SHAPE[1]))
     np.testing.assert_allclose(found, true, atol=2e-3)
+
+
+def test_steps_are_means_of_neighbours(tmp_path: Path) -> None:
+    """Until half a bin beyond the last value on either side; from there on it is that value."""
+    row = np.array([np.nan, 3.0, 8.0, 4.0, np.nan, 7.0, 1.0, np.nan, np.nan])
+    found = drawn(tmp_path, np.tile(row, (7, 1)), INTERPSTYLE=CONSTANT)
+    good = np.isfinite(row)
+    x, y = centres(SHAPE[1], 9)[good], row[good]
+    expected = np.empty(SHAPE[1])
+    for place in range(SHAPE[1]):
+        right = int(np.sum(0.5 * (x[:-1] + x[1:]) <= place))
+        expected[place] = y[0] if right == 0 else 0.5 * (y[right - 1] + y[right])
+        if place >= x[-1] + 0.5 * (x[-1] - x[-2]):
+            expected[place] = y[-1]
+    np.testing.assert_array_equal(found, np.tile(expected, (SHAPE[0], 1)))
+
+
+@pytest.mark.parametrize("weighted", [True, False])
+def test_a_polynomial_of_noisy_bins_is_that_of_least_squares(weighted: bool, tmp_path: Path) -> None:
+    """Of the total degree, with weights that are inverse variances if they count, in powers of the pixels."""
+    rng = np.random.default_rng(77)
+    values, variance = rng.normal(1000.0, 30.0, (7, 9)), rng.uniform(1.0, 50.0, (7, 9))
+    values[2, 3] = np.nan
+    fits.PrimaryHDU(np.zeros(SHAPE)).writeto(tmp_path / "frame.fits")
+    cards = {"APPROXSTYLE": 0, "APPROXORDERX": 4, "APPROXORDERY": 4, "APPROXWEIGHTING": weighted}
+    path = write(tmp_path / "background.fits", values, variance=variance, **cards)
+    (image,) = observed_images(tmp_path / "frame.fits")
+    powers = [(i, j) for i in range(5) for j in range(5 - i)]
+
+    def terms(y: Any, x: Any) -> np.ndarray:
+        return np.stack([(y / 70.0) ** i * (x / 95.0) ** j for i, j in powers], axis=-1)
+
+    down, across = np.meshgrid(centres(SHAPE[0], 7), centres(SHAPE[1], 9), indexing="ij")
+    good = np.isfinite(values)
+    root = 1.0 / np.sqrt(variance.astype(np.float32)[good].astype(float)) if weighted else np.ones(good.sum())
+    known = values.astype(np.float32)[good].astype(float)
+    found = np.linalg.lstsq(terms(down, across)[good] * root[:, None], known * root, rcond=None)[0]
+    y, x = np.indices(SHAPE, dtype=float)
+    np.testing.assert_allclose(image.pixels(path), terms(y, x) @ found, atol=1e-5)
 
 
 def test_backgrounds_add_up(tmp_path: Path) -> None:

@@ -126,6 +126,21 @@ def test_a_background_is_put_back(tmp_path):
         observed_images(path)[0].read(other)
 
 
+def test_a_background_is_the_first_image_where_none_has_the_name_and_the_number(tmp_path):
+    """Tables and images without pixels are passed over; a file with nothing else is refused."""
+    table = fits.BinTableHDU.from_columns([fits.Column("x", "D", array=np.arange(3.0))])
+    path = write(tmp_path / "frame.fits", fits.ImageHDU(IMAGE, name="SCI"))
+    other = write(
+        tmp_path / "sky.fits", fits.ImageHDU(), table, fits.ImageHDU(IMAGE + 5.0), fits.ImageHDU(IMAGE)
+    )
+    (image,) = observed_images(path)
+    np.testing.assert_array_equal(image.read(other).image, 2.0 * IMAGE + 5.0)
+    for hdus in ([], [fits.ImageHDU()]):
+        (tmp_path / "nothing.fits").unlink(missing_ok=True)
+        with pytest.raises(FrameFormatError, match="image is None"):
+            image.read(write(tmp_path / "nothing.fits", *hdus))
+
+
 def test_exposure_of_lsst_images_without_that_package(tmp_path, monkeypatch):
     """Its tree names sensor and filter; only a background that it holds has to be drawn by the package."""
     tree = {"detector": {"attributes": {"name": "R22_S11"}}, "obs_info": {"physical_filter": "y_10"}}

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from lsst.fringe_sim.products import (
     describe_mask,
     mask_bits,
 )
+from lsst.fringe_sim.products.flat_fit import FlatFit
 from lsst.fringe_sim.products.mask import ALL_BITS, planes_from_header, remap_mask
 
 GOOD = np.zeros((3, 4), dtype=int)
@@ -400,3 +403,24 @@ def test_a_bit_without_a_name_is_refused() -> None:
 def test_headers_that_name_planes_badly(header: dict[str, object], error: type[Exception]) -> None:
     with pytest.raises(error):
         planes_from_header(header)
+
+
+def arrays_in(value: Any) -> Iterator[np.ndarray]:
+    """Arrays in the fields of a product, and in what it is made of."""
+    if isinstance(value, np.ndarray):
+        yield value
+    elif dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            yield from arrays_in(getattr(value, field.name))
+
+
+@pytest.mark.parametrize("kind", sorted(MAKERS))
+def test_arrays_of_a_product_cannot_be_written(kind: str) -> None:
+    """Nor is anything taken from those that it was made of."""
+    ones = np.ones(2)
+    flats = FlatFit(np.array([900.0, 960.0]), *(ones,) * 5)
+    product = MAKERS[kind](**({"flats": flats} if kind == "ThicknessMap" else {}))
+    found = list(arrays_in(product))
+    assert len(found) >= 2
+    assert not any(each.flags.writeable for each in found)
+    assert ones.flags.writeable

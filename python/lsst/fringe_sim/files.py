@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import io
+import json
 import os
 import re
 import secrets
@@ -14,7 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from glob import has_magic, iglob
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .errors import InputError
 
@@ -82,6 +83,11 @@ def same_file_key(name: str) -> str:
     Those of macOS and Windows take upper and lower case for the same, and accents however they are coded.
     """
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+
+
+def json_text(value: Any) -> str:
+    """A value in JSON, as people read it."""
+    return json.dumps(value, indent=2)
 
 
 def table_text(table: Table) -> str:

@@ -231,12 +231,13 @@ def open_user_fits(
     path: str | os.PathLike[str],
     *,
     warning: Literal["ignored", "truncated", "error"] = "ignored",
+    memmap: bool = False,
     **options: Any,
 ) -> Iterator[fits.HDUList]:
     """Open a FITS file from outside, which may be anything; see `check_axes`, else one of `DAMAGE`.
 
-    ``warning``: which warnings of astropy are errors: none, that the file is too short, or all. ``options`` are
-    those of `astropy.io.fits.open`.
+    ``warning``: which warnings of astropy are errors: none, that the file is too short, or all. ``memmap`` and
+    ``options`` are those of `astropy.io.fits.open`.
     """
     from astropy.io import fits
 
@@ -248,7 +249,7 @@ def open_user_fits(
         if warning == "truncated":  # of which astropy warns, and goes on
             warnings.filterwarnings("error", message=".*truncated.*")
         check_axes(stream, str(path))
-        with fits.open(stream, **options) as hdus:
+        with fits.open(stream, memmap=memmap, **options) as hdus:
             yield hdus
 
 
@@ -257,7 +258,7 @@ def complete_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
     """Open a FITS file from outside, headers first; one that is damaged or cut short is refused by its name."""
     with (
         refuse_damage("file", "a complete FITS file", str(path)),
-        open_user_fits(path, warning="truncated", memmap=False) as hdus,
+        open_user_fits(path, warning="truncated") as hdus,
     ):
         yield hdus
 

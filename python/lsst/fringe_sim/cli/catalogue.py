@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ..errors import UnknownNameError
+from ..files import json_text
 from .command import argument, command, flag
 from .parameters import with_effects_from
 
@@ -43,7 +43,7 @@ def setups(as_json: bool = flag("Machine-readable.", "--json")) -> None:
             }
             for setup in found
         ]
-        click.echo(json.dumps(rows, indent=2))
+        click.echo(json_text(rows))
         return
     width = max(len(setup.name) for setup in found)
     for setup in found:
@@ -105,7 +105,7 @@ def effects(
             }
             for effect in shown
         ]
-        click.echo(json.dumps(rows, indent=2))
+        click.echo(json_text(rows))
         return
     for effect in shown:
         click.echo(f"{effect.name}  ({effect.acts_on}: {effect.title})")

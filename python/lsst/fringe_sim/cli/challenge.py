@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ..errors import InputError
-from ..files import write_whole
+from ..files import json_text, write_whole
 from .command import command, flag, option
 from .output import OutputFolder, origin_of, output_folder
 from .parameters import LABORATORY, SIZE, laboratory_of_the_mock
@@ -74,7 +74,7 @@ def challenge(
     )
     path = result.write(out.path)
     write_challenge_report(out.path / "challenge.html", result, origin_of(out.path, ()))
-    click.echo(json.dumps(result.summary(), indent=2))
+    click.echo(json_text(result.summary()))
     click.echo(str(path))
 
 
@@ -88,7 +88,7 @@ def _earlier_cases(record: Path, identity: dict[str, int | str]) -> list[CaseRes
         return []
     if lines[0] != json.dumps(identity):
         raise InputError(
-            f"challenge in {record.parent}", lines[0][:100], f"{json.dumps(identity)}, or another folder"
+            f"challenge in {record.parent}", lines[0], f"{json.dumps(identity)}, or another folder"
         )
     # A line that a killed run left unfinished is not a case.
     complete = [line for line in lines[1:] if line.endswith("}")]

@@ -75,16 +75,16 @@ def _simulated() -> None:
     import numpy as np
 
     from ..mock.raw_frames import write_mock_flats
+    from ..mock.thickness import random_field
 
-    thickness = 15.0 + np.linspace(0.0, 1.0, 64 * 64).reshape(64, 64)
     with TemporaryDirectory() as folder:
         write_mock_flats(
             folder,
             setup="ts8_e2v",
             detector="E2V-CCD250-321",
-            thickness_um=thickness,
+            thickness_um=random_field((64, 64), np.random.default_rng()),
             wavelengths_nm=[950.0],
-            rng=np.random.default_rng(1),
+            rng=np.random.default_rng(),
             size="64x64",
             n_bias=1,
         )

@@ -19,7 +19,7 @@ import click
 
 from .. import __version__
 from ..errors import FringeSimError, InputError
-from ..files import write_whole
+from ..files import json_text, write_whole
 from .command import command, flag, option
 from .output import LOCK, OutputFolder, output_folder
 from .parameters import SIZE
@@ -149,7 +149,7 @@ class DemoRun:
         self.step(name, f"pipetask run: {what}", lambda: self.program(name, *words))
 
     def _remember(self) -> None:
-        text = json.dumps({"settings": asdict(self.settings), "done": self._done}, indent=2)
+        text = json_text({"settings": asdict(self.settings), "done": self._done})
         write_whole(self._state, text)
 
 

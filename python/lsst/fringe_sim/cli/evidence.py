@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
-
 import click
 
-from ..files import write_whole
+from ..files import json_text, write_whole
 from .command import command, flag, option
 from .output import OutputFolder, output_folder
 from .parameters import with_effects_from
@@ -56,7 +54,7 @@ def evidence(
     text = evidence_text(found)
     click.echo(text)
     if folder is not None:
-        write_whole(folder / "evidence.json", (json.dumps(found.content(), indent=2) + "\n").encode())
-        write_whole(folder / "evidence.txt", (text + "\n").encode())
+        write_whole(folder / "evidence.json", f"{json_text(found.content())}\n")
+        write_whole(folder / "evidence.txt", f"{text}\n")
         for name in ("evidence.json", "evidence.txt"):
             click.echo(str(folder / name))

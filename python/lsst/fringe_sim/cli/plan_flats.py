@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..files import table_text, write_whole
+from ..files import json_text, table_text, write_whole
 from .command import command, flag, option
 from .output import refuse_used_file
 from .parameters import LABORATORY, THICKNESS_RANGE, WAVELENGTHS, ChosenEffects, Quantity, model_effects
@@ -112,7 +111,7 @@ def plan_flats(
     if as_json:
         found = _as_mapping(now, ranked, short, slip_limit)
         found["nyquist_um"] = nyquist_thickness_um(model, nominal).tolist()
-        click.echo(json.dumps(found, indent=2))
+        click.echo(json_text(found))
     else:
         _print(now, ranked, short, slip_limit, width)
         _print_nyquist(nyquist_thickness_um(model, nominal), range_um)

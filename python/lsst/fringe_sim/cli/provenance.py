@@ -13,6 +13,7 @@ from uuid import UUID
 import click
 
 from ..errors import LONGEST_VALUE, FrameFormatError, InputError, UnknownNameError, printable_name, shown
+from ..files import json_text
 from .command import argument, command, flag, option
 
 BUTLER = "LSST BUTLER "
@@ -53,7 +54,7 @@ def provenance(
         else:
             records.append({"file": target, **describe(read_header(target))})
     if as_json:
-        click.echo(json.dumps(records, indent=2))
+        click.echo(json_text(records))
         return
     click.echo("\n\n".join(_as_text(record) for record in records))
 
@@ -101,7 +102,7 @@ def _fits_header(path: str) -> dict[str, Any]:
 
     from ..resources import open_user_fits
 
-    with open_user_fits(path, memmap=True, lazy_load_hdus=True) as hdus:
+    with open_user_fits(path) as hdus:
         header = hdus[0].header
         return {key: header[key] for key in header if key and not isinstance(header[key], Undefined)}
 

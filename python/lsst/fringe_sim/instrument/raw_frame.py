@@ -191,7 +191,7 @@ def _open_fits(source: str) -> Iterator[fits.HDUList]:
     if not Path(source).is_file():
         raise FrameFormatError("file", source, "an existing FITS file")
     try:
-        with open_user_fits(source, warning="truncated", memmap=False, lazy_load_hdus=False) as hdus:
+        with open_user_fits(source, warning="truncated", lazy_load_hdus=False) as hdus:
             yield hdus
     except InputError as error:
         raise (error if error.source else error.in_source(source)) from None
@@ -253,8 +253,8 @@ def _with_unused(metadata: RawMetadata, hdus: Sequence[Any]) -> RawMetadata:
 
 def _integer_pixels(hdu: Any, source: str) -> npt.NDArray[np.integer[Any]]:
     data = hdu.data
-    if data is None or data.shape != image_shape(hdu, source):
-        found = None if data is None else data.shape
+    found = getattr(data, "shape", None)
+    if found != image_shape(hdu, source):
         raise FrameFormatError(f"{hdu.name} pixels", found, "a complete image", source=source)
     if data.dtype.kind not in "iu":
         raise FrameFormatError(f"{hdu.name} BITPIX", data.dtype.name, "integer ADU", source=source)

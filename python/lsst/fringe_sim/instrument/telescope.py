@@ -150,6 +150,10 @@ class ConeOptics:
             np.outer(tangent, np.cos(azimuth)).ravel(), np.outer(tangent, np.sin(azimuth)).ravel(), 1.0
         )
 
+    def beam(self, nodes: int) -> Beam:
+        """Angles of incidence at every field position, as a Gauss rule."""
+        return Beam.cone(self.f_number, self.obscuration, nodes)
+
 
 @named_units
 @dataclass(frozen=True)
@@ -264,7 +268,7 @@ class Telescope:
         """
         self._check_field(field_x_deg, field_y_deg)
         if isinstance(self.optics, ConeOptics):
-            return Beam.cone(self.optics.f_number, self.optics.obscuration, nodes)
+            return self.optics.beam(nodes)
         if self.optics.axisymmetric:
             field_x_deg, field_y_deg = math.hypot(field_x_deg, field_y_deg), 0.0
         return beam_of_quantiles(_traced_quantiles(self.optics, field_x_deg, field_y_deg), nodes)

@@ -26,7 +26,7 @@ from ..instrument.camera import Camera, Detector
 from ..instrument.night import StochasticNight
 from ..instrument.ray_bundle import lagrange_weights
 from ..instrument.sky import SkySpectrum, SpectralComponent, blend_components
-from ..instrument.telescope import ConeOptics, Telescope, telescope_beam
+from ..instrument.telescope import ConeOptics, telescope_beam
 from .film_fields import add_mode, add_periodic_mode, light_in
 from .hidden_effect import ActiveHiddenEffect
 from .hidden_effects import validate_effects, with_hidden_optics
@@ -143,8 +143,7 @@ def _of_the_sky(setup: str) -> dict[str, Any]:
 def _angles(beam: Mapping[str, Any], radius_deg: float, nodes: int) -> tuple[FloatArray, FloatArray]:
     """Angles of incidence [rad] and their weights."""
     if beam["kind"] == "cone":
-        cone = ConeOptics(float(beam["f_number"]), float(beam.get("obscuration", 0.0)))
-        found = Telescope("cone", cone, 1.0, 1.0, 1.0, math.inf).beam(nodes=nodes)
+        found = ConeOptics(float(beam["f_number"]), float(beam.get("obscuration", 0.0))).beam(nodes)
     else:
         found = telescope_beam(str(beam["telescope"]), radius_deg, 0.0, nodes)
     return found.theta, found.weight

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..errors import FrameFormatError, InputError
 from ..files import all_or_nothing
 from ..resources import open_user_fits, refuse_damage
-from ._check import check_mapping
+from ._check import check_mapping, read_only
 from .mask import mask_plane_cards, planes_from_header, remap_mask
 from .sensor_section import SECTION_KEYWORDS, SensorSection
 
@@ -159,9 +159,8 @@ def image_hdu(
     name: str, data: NDArray[Any], *, unit: str | None = None, cards: Sequence[tuple[str, Any, str]] = ()
 ) -> fits.ImageHDU:
     """Image extension; ``data`` is not copied and not changed."""
-    view = data.view()
-    view.flags.writeable = False  # astropy swaps the bytes of writeable arrays in place
-    hdu = _SteadyImage(view, name=name)
+    # Astropy swaps the bytes of writeable arrays in place.
+    hdu = _SteadyImage(read_only(data), name=name)
     if unit is not None:
         hdu.header["BUNIT"] = unit
     for card in cards:

@@ -38,14 +38,12 @@ def afw_background(hdus: fits.HDUList) -> FloatArray:
     Raises `FrameFormatError`: backgrounds of different images, a spline that is not known, or bins that are too few
     for it.
     """
-    total: FloatArray | None = None
+    total = np.zeros(())
     for number in range(0, len(hdus), _PARTS):
         made = _drawn(hdus[number], hdus[number + 2])
-        if total is not None and made.shape != total.shape:
+        if number and made.shape != total.shape:
             raise FrameFormatError("shape of a background", made.shape, f"{total.shape}, that of the first")
-        total = made if total is None else total + made
-    if total is None:
-        raise FrameFormatError("backgrounds", 0, "one or more")
+        total = total + made
     return total
 
 
@@ -171,8 +169,7 @@ def _polynomial(
     """Chebyshev polynomial of a total degree, fitted to the bins by weighted least squares."""
 
     def terms(places: FloatArray, side: int) -> FloatArray:
-        scaled = (2 * places + 1 - side) / side
-        return np.asarray(np.polynomial.chebyshev.chebvander(scaled, order), dtype=np.float64)
+        return np.asarray(np.polynomial.chebyshev.chebvander(places / side, order), dtype=np.float64)
 
     chosen = [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]
     down, across = (terms(place, side) for place, side in zip(centres, shape, strict=True))

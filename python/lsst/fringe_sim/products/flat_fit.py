@@ -12,6 +12,7 @@ from astropy.io import fits
 from ..array_types import FloatArray
 from ..errors import FrameFormatError, named_units
 from . import _fits as io
+from ._check import read_only
 from .fits_product import Extension
 
 FLAT_COLUMNS = (
@@ -57,8 +58,7 @@ class FlatFit:
     def __post_init__(self) -> None:
         length = np.size(self.wavelength_nm)
         for name, _ in FLAT_COLUMNS:
-            array = np.array(getattr(self, name), dtype=float)
-            array.setflags(write=False)
+            array = read_only(np.array(getattr(self, name), dtype=float))
             if array.shape != (length,):
                 raise FrameFormatError(f"FLATS.{name}", array.shape, f"({length},)")
             object.__setattr__(self, name, array)

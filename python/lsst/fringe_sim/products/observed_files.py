@@ -204,7 +204,7 @@ def _as_stored(source: Path) -> Iterator[fits.HDUList]:
     """The file, with compressed images as the tables that they are stored as."""
     with (
         refuse_damage("file", "a complete FITS file", str(source)),
-        open_user_fits(source, warning="truncated", memmap=False, disable_image_compression=True) as hdus,
+        open_user_fits(source, warning="truncated", disable_image_compression=True) as hdus,
     ):
         yield hdus
 

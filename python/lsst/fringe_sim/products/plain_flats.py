@@ -139,15 +139,11 @@ class PlainImage:
             raise InputError("IMGTYPE", self.kind, "flat", source=self.source)
         return self.wavelength_nm
 
-    def counts(self) -> NDArray[np.float32]:
-        """Pixels as they stand in the file, after ``BSCALE`` and ``BZERO``; NaN where it has ``BLANK``.
+    def _read(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Pixels as they stand in the file, after ``BSCALE`` and ``BZERO``, and whether they are saturated.
 
         Those of amplifiers are put where they belong, less the median of the overscan at their side, if there is one.
         """
-        return self._read()[0]
-
-    def _read(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Pixels, and whether they are saturated."""
         counts = np.empty(self.shape, np.float32)
         full = np.zeros(self.shape, np.bool_)
         with complete_fits(self.source) as hdus:

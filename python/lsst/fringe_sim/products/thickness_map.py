@@ -159,7 +159,7 @@ class ThicknessMap(SensorProduct):
             raise InputError("file", source, "an existing FITS file")
         with (
             refuse_damage("file", "a complete FITS file", source),
-            open_user_fits(path, warning="truncated", memmap=False) as hdus,
+            open_user_fits(path, warning="truncated") as hdus,
         ):
             product = hdus[0].header.get(io.PRODUCT_KEY, "")
             if product == cls.__name__ and _unit_of(hdus, 1) == "um":
