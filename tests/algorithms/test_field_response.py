@@ -9,6 +9,7 @@ import pytest
 from sky_frames import bright_sky
 from slow_cases import first_is_quick
 
+from lsst.fringe_sim.algorithms.angular_response import of_other_silicon
 from lsst.fringe_sim.algorithms.field_response import (
     SensorPlacement,
     SensorResponse,
@@ -143,6 +144,30 @@ def test_a_frame_does_not_depend_on_how_finely_the_sensor_is_sampled(angular):
     fine = np.full((99, 99), 16.1)
     coarse = fine[1::3, 1::3]
     np.testing.assert_allclose(sensor.sky().frame(fine)[1::3, 1::3], sensor.sky().frame(coarse), rtol=1e-6)
+
+
+def test_silicon_of_another_thickness_is_seen_on_the_same_grids():
+    """By the same numbers as if it had been calculated alone, but for continua between two that are known."""
+    layer, place, few = (15.0, 15.3), (0.03, 0.09), 24
+    thick = [f"silicon_thickness.offset={offset}" for offset in (0.0, 0.01, 0.02)]
+    models = [
+        FringeModel.from_setup("lsst_e2v", {name: float(value)})
+        for name, value in (one.split("=") for one in thick)
+    ]
+    first, middle, last = (angular_response(one, bright_sky(2), place, layer, few) for one in models)
+    assert last.silicon_um - first.silicon_um == pytest.approx(0.02, rel=1e-9)
+    again = of_other_silicon(first, models[1], bright_sky(2))
+    between = of_other_silicon(
+        first, models[1], bright_sky(2), of_other_silicon(first, models[2], bright_sky(2))
+    )
+    for found in (again, between):
+        assert found.silicon_um == middle.silicon_um
+        assert found.component == middle.component
+        np.testing.assert_allclose(found.values, middle.values, rtol=1e-4)
+        np.testing.assert_allclose(found.flat, middle.flat, rtol=1e-4)
+    lines = slice(first.n_lines)
+    assert np.abs(first.values / middle.values - 1.0)[lines].max() > 1e-3
+    assert np.abs(between.values - again.values)[lines].max() == 0.0
 
 
 @pytest.mark.slow

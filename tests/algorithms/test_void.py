@@ -6,15 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from foreign_sky import foreign_map
+from recorded_numbers import Record
 
 from lsst.fringe_sim.algorithms import fit_thickness, simulate_sky_frame
 from lsst.fringe_sim.algorithms.discovery import discover
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.flat_residual import flat_residual
-from lsst.fringe_sim.challenge.sealed_cases import SealedCase, draw_case
+from lsst.fringe_sim.algorithms.thickness_fit.islands import fit_islands
+from lsst.fringe_sim.challenge.sealed_cases import SealedCase, draw_case, expose
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.errors import UnknownNameError
 from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import ThicknessMap
+from lsst.fringe_sim.products.mask import mask_bits
 
 (VOID,) = (effect for effect in EFFECTS if effect.name == "void")
 PLACE = {"void.centre_x": 21.3, "void.centre_y": 13.8, "void.radius": 7.4}
@@ -118,6 +123,35 @@ def test_a_gap_everywhere_is_wider_on_the_island() -> None:
     np.testing.assert_allclose(
         inside.response(thickness, wavelength), wider.response(thickness, wavelength), rtol=1e-9
     )
+
+
+def test_pixels_on_a_void_are_fitted_with_the_optics_that_they_have(recorded: Record) -> None:
+    """Also where the first fit is wrong by orders, by a phase and by noise; the rest of the map stays as it is."""
+    rng, shape = np.random.default_rng(12), (26, 30)
+    void = {"void.centre_x": 12.3, "void.centre_y": 11.8, "void.radius": 6.5, "void.thickness": 190.0}
+    truth = foreign_map(rng, shape, 14.0, 14.6)
+    cube, _ = expose(truth, void, rng)
+    mask = np.array(cube.mask)
+    mask[:3, 10:12, 12], mask[:, 13, 9] = mask_bits("BAD"), mask_bits("BAD")
+    cube = replace(cube, mask=mask)
+    model = FringeModel.from_setup("ts8_e2v", void)
+    part = VOID.coverage({key.partition(".")[2]: x for key, x in void.items()}, geometry(shape))
+    order = float(np.mean(model.fringe_order_um(cube.wavelength_nm)))
+    wrong = truth + 0.004 * rng.standard_normal(shape) + (part > 0.5) * (2.0 * order + 0.06)
+    wrong[3, 25] = np.nan
+    flagged = np.where((part > 0.3) & (truth > 14.3), mask_bits("SUSPECT"), 0).astype(np.int32)
+    flagged[3, 25] = mask_bits("NO_DATA")
+    ones = np.ones(shape, np.float32)
+    first = ThicknessMap(
+        wrong.astype(np.float32), 0.01 * ones, ones, 0.0 * ones, flagged, "adhesive", {"MISFIT": 1.5}
+    )
+    found = fit_islands(first, cube, model)
+    on = (part > 0.0) & (cube.mask == 0).any(axis=0)
+    for name in ("value", "sigma", "chi2", "mask"):
+        np.testing.assert_array_equal(getattr(found, name)[~on], getattr(first, name)[~on])
+    assert np.median(np.abs(found.value - truth)[on]) < 0.004
+    assert np.median(np.abs(found.value - truth)[on] / found.sigma[on]) < 1.2
+    recorded({name: getattr(found, name) for name in ("value", "sigma", "chi2", "mask")})
 
 
 def sealed(gap_nm: float, seed: int) -> SealedCase:

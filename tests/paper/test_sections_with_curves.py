@@ -30,6 +30,7 @@ SMALLER = {
     (coadds, "TREECORR_PX"): 24,
     (optics, "PATH_RAYS"): 4,
     (optics, "BINS"): (10, 50),
+    (optics, "BEAM_NODES"): 64,
 }
 """What takes long, smaller."""
 
@@ -94,9 +95,7 @@ def context(tmp_path_factory: pytest.TempPathFactory) -> Context:
 @pytest.mark.parametrize(
     "compute",
     [
-        pytest.param(
-            one, id=one.__name__, marks=[pytest.mark.slow] * (one.__name__ in ("hsc", "angles"))
-        )  # seconds
+        pytest.param(one, id=one.__name__, marks=[pytest.mark.slow] * (one.__name__ == "hsc"))  # seconds
         for one in SECTIONS
     ],
 )

@@ -1,0 +1,84 @@
+"""Single stages on one small sensor: sets of effects, pairs, and neighbouring minima."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from foreign_sky import foreign_map
+from recorded_numbers import Record
+
+from lsst.fringe_sim.algorithms.discovery.evaluations import count_evaluations
+from lsst.fringe_sim.algorithms.discovery.fit import fit_model
+from lsst.fringe_sim.algorithms.discovery.pairs import fitted_pair, likely_pairs
+from lsst.fringe_sim.algorithms.discovery.preparation import Prepared, prepare
+from lsst.fringe_sim.algorithms.discovery.selection import Hypothesis, Selector
+from lsst.fringe_sim.challenge.sealed_cases import expose
+from lsst.fringe_sim.effects import EFFECTS
+from lsst.fringe_sim.model import FringeModel
+
+NAMES = ("silicon_thickness", "contrast_loss", "bandwidth", "ghost_pedestal")
+HIDDEN = {"silicon_thickness.offset": 0.05, "contrast_loss.factor": 0.95}
+
+
+@pytest.fixture(scope="module")
+def prepared() -> Prepared:
+    rng = np.random.default_rng(21)
+    cube, _ = expose(foreign_map(rng, (20, 24), 14.0, 14.3), HIDDEN, rng)
+    known = [one for one in EFFECTS if one.name in NAMES]
+    return prepare(
+        cube.take(np.arange(0, len(cube.image), 2)), FringeModel.from_setup("ts8_e2v"), known, 20_000
+    )
+
+
+def selector_of(prepared: Prepared, *, generic: bool = True) -> Selector:
+    known = [one for one in EFFECTS if one.name in NAMES]
+    shifts = np.linspace(-0.06, 0.06, 5)
+    guess = {"silicon_thickness.offset": 0.03}
+    return Selector(
+        prepared.problem, known, prepared.null, prepared.index, generic=generic, shifts_um=shifts, guess=guess
+    )
+
+
+def told(found: Hypothesis) -> dict[str, object]:
+    fit = found.fit
+    return {
+        "names": found.names, "settings": fit.settings, "chi2": fit.chi2, "spread": fit.spread,
+        "evidence": found.log_evidence, "channels": found.channels,
+    }  # fmt: skip
+
+
+def test_sets_of_a_small_sensor_are_as_recorded(prepared: Prepared, recorded: Record) -> None:
+    selector = selector_of(prepared)
+    one = selector.hypothesis(("silicon_thickness",))
+    settled = selector.settled(one)
+    pairs = likely_pairs(selector, prepared.null, NAMES[1:])
+    both = fitted_pair(selector, selector.null, pairs[0])
+    assert pairs[0].gain == pytest.approx(prepared.null.chi2 - both.fit.chi2, rel=0.3)
+    recorded({
+        "one": told(one), "settled": told(selector.with_channels(settled)), "both": told(both),
+        "pairs": [{"names": pair.names, "starts": pair.starts, "gain": pair.gain} for pair in pairs],
+        "scores": [(each.name, each.gain, each.promise) for each in selector.score(one.fit, NAMES[1:])],
+        "ends": selector.at_end_of_range(both.fit),
+        "spots": [selector.evidence_of_spots(each) for each in (one, both)],
+    })  # fmt: skip
+
+
+def test_few_pixels_are_judged_by_all_their_values(prepared: Prepared) -> None:
+    """By what a fit leaves of them, beside the degrees of freedom that are left."""
+    selector = selector_of(prepared, generic=False)
+    (channel,) = (one for one in selector.null.channels if one.name == "all values")
+    problem = prepared.problem
+    free = int((problem.cells.weight > 0.0).sum()) - problem.basis.size - problem.level_basis.shape[1]
+    assert channel.statistic == prepared.null.chi2
+    assert channel.degrees == free
+    assert selector.evidence_of_spots(selector.null) == 0.0
+
+
+def test_evaluations_are_counted(prepared: Prepared) -> None:
+    with count_evaluations() as count:
+        fit_model(prepared.problem, (), np.zeros(0), prepared.null.field)
+    with count_evaluations() as again:
+        for _ in range(2):
+            fit_model(prepared.problem, (), np.zeros(0), prepared.null.field)
+    assert count.number >= 1
+    assert again.number == 2 * count.number
