@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
+from lsst.fringe_sim.algorithms.discovery.channels import Channel
+from lsst.fringe_sim.algorithms.discovery.marginal.critics import is_out_of_reach
 from lsst.fringe_sim.algorithms.discovery.marginal.naming import name_effects
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
 from lsst.fringe_sim.algorithms.discovery.marginal.scores import Scorer, best_gain
@@ -84,6 +88,26 @@ def test_two_effects_do_not_take_the_place_of_the_right_one(rng: np.random.Gener
     search._exchange_for_two(one, "wavelength_offset")
     assert not search._is_beaten(one)
     assert not any("wavelength_offset" in names for names in search.pool if len(names) == 2)
+
+
+@pytest.mark.rng("what is hoped for")
+def test_an_effect_is_hoped_to_bring_no_more_than_it_has_brought(rng: np.random.Generator) -> None:
+    search = search_of(rng, {"wavelength_offset.offset": 0.6})
+    scored = {one.name: one for one in search.scores(search.null)}
+    before = search.hoped(scored["bandwidth"])
+    assert before == pytest.approx(max(scored["bandwidth"].gain, 0.0) / Rules().least_of_promise)
+    brings = search._added(search.null, scored["bandwidth"]).log_evidence - search.null.log_evidence
+    assert search.hoped(replace(scored["bandwidth"], gain=1e6)) == pytest.approx(max(brings, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "fall", "out"),
+    [("thickness phase", 0.0, True), ("thickness phase", 300.0, True), ("thickness phase", 420.0, False),
+     ("amplifiers", 0.0, True), ("texture", 0.0, False)],
+)  # fmt: skip
+def test_what_is_left_is_out_of_reach_where_no_effects_take_it_off(name: str, fall: float, out: bool) -> None:
+    found = cast(Hypothesis, SimpleNamespace(point=SimpleNamespace(response=np.ones((2, 3))), chi2=0.0))
+    assert is_out_of_reach([Channel(name, 500.0, 100.0, 0.0)], found, found, fall, Rules()) == out
 
 
 @pytest.mark.parametrize(("number", "named"), [(1, True), (2, True), (3, False)])

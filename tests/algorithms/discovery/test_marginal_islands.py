@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
 from scipy.interpolate import RectBivariateSpline
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, discover
+from lsst.fringe_sim.algorithms.discovery.marginal import critics
+from lsst.fringe_sim.algorithms.discovery.marginal.critics import judge, spot_scores
+from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
 from lsst.fringe_sim.algorithms.discovery.marginal.search import Catalogue
 from lsst.fringe_sim.algorithms.discovery.marginal.smooth import beside_smooth
-from lsst.fringe_sim.algorithms.inference import CellShape, Data, Forward, Point, Problem, relaxed
+from lsst.fringe_sim.algorithms.inference import (
+    CellShape,
+    Data,
+    Forward,
+    Point,
+    Problem,
+    coordinates_of,
+    fit,
+    relaxed,
+)
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry, Residuals
 from lsst.fringe_sim.effects.disc_search import find_step
 from lsst.fringe_sim.mock.thickness import random_field
@@ -56,8 +71,8 @@ def test_two_voids_are_named() -> None:
             assert abs(own.value - true) < 4.0 * own.sigma + 1e-3 * true
 
 
-def point_of(rng: np.random.Generator, step_um: float) -> Point:
-    """Cells of which each has a thickness of its own, which is even but for a step on a disc."""
+def point_of(rng: np.random.Generator, step_um: float, stain: float = 0.0) -> Point:
+    """Cells of which each has a thickness of its own, even but for a step on a disc; ``stain``: depth of a spot."""
     place = np.arange(40.0)
     y, x = place[:, np.newaxis], place
     even = 15.0 + 0.02 * x + 0.01 * y + 3e-4 * x * y
@@ -67,7 +82,8 @@ def point_of(rng: np.random.Generator, step_um: float) -> Point:
     forward = Forward(
         FringeModel.from_setup("ts8_e2v"), EFFECTS, geometry, CellShape.of_field(even, 1), limits
     )
-    value = forward.predict({}, thickness.ravel())[0] + 0.007 * rng.standard_normal((12, 1600))
+    dark = 1.0 - stain * np.exp(-0.5 * ((y - 25.0) ** 2 + (x - 12.0) ** 2) / 3.0**2)
+    value = dark.ravel() * forward.predict({}, thickness.ravel())[0] + 0.007 * rng.standard_normal((12, 1600))
     problem = Problem(Data(value, np.full(value.shape, 0.007**-2.0)), forward, even.ravel(), 1e-3)
     return relaxed(problem.at({}, np.ones(12), even.ravel()), rounds=6)
 
@@ -109,3 +125,30 @@ def test_the_second_of_an_effect_is_looked_for_beside_the_first(rng: np.random.G
     assert not catalogue.may_leave(("void",), ("void", "void_2"))
     assert catalogue.may_leave(("void_2",), ("void", "void_2"))
     assert catalogue.may_leave(("void", "void_2"), ("void", "void_2", "bandwidth"))
+
+
+@pytest.mark.rng("stain of the core")
+@pytest.mark.parametrize(("depth", "seen"), [(0.0, False), (0.004, True)])
+def test_a_stain_is_seen(rng: np.random.Generator, depth: float, seen: bool) -> None:
+    null = fit((), (), point_of(rng, 0.0, depth))
+    channels = {one.name: one for one in judge(null, null, np.full(12, 1.5), Rules())}
+    assert (channels["spots"].probability < 1e-3) == seen
+    evidence = spot_scores(null).evidence()
+    assert evidence > 5.0 if seen else evidence < 3.0
+
+
+@pytest.mark.rng("trend of the core")
+def test_errors_of_single_exposures_that_follow_a_curve_are_no_draws(rng: np.random.Generator) -> None:
+    forward = point_of(rng, 0.0).problem.forward
+    (effect,) = (one for one in EFFECTS if one.name == "wavelength_jitter")
+    items = coordinates_of(effect, forward)
+    draws, curve = rng.standard_normal(len(items)), np.linspace(-1.0, 1.0, len(items)) ** 3
+    chances = []
+    for values in (draws, curve + 0.02 * draws):
+        found = SimpleNamespace(
+            items=items, values=values, covariance=1e-4 * np.eye(len(items)),
+            point=SimpleNamespace(problem=SimpleNamespace(forward=forward)),
+        )  # fmt: skip
+        (channel,) = critics._trends(cast(critics.Judged, SimpleNamespace(found=found)))
+        chances.append(channel.probability)
+    assert chances[0] > 1e-3 > chances[1]

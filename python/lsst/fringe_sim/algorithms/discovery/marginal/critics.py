@@ -29,7 +29,16 @@ from ..spots import SpotScores
 from ..trends import FEWEST_DRAWS, trend_channel
 from .rules import Rules
 
-__all__ = ["CRITICS", "Judged", "judge", "spot_scores", "spots_instead", "state_of", "total_chance"]
+__all__ = [
+    "CRITICS",
+    "Judged",
+    "is_out_of_reach",
+    "judge",
+    "spot_scores",
+    "spots_instead",
+    "state_of",
+    "total_chance",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -99,6 +108,9 @@ def state_of(point: Point, columns: Columns, known: FloatArray | float = 0.0) ->
     design = cast(Any, SimpleNamespace(slope=point.steep.reshape(shape)))
     return State(design, left.reshape(shape), raw, value, point.thickness_um.reshape(shape[1:]), flat)
 
+
+PROJECTED = ("thickness phase", "large scales", "amplifiers")
+"""Channels whose statistic is the fall of χ² with columns that are free."""
 
 Critic = Callable[[Judged], Sequence[Channel]]
 
@@ -205,12 +217,31 @@ def judge(
 
     ``block``: see `Judged`.
     """
-    point = found.point
-    fringes = point.response - point.response.mean(axis=1, keepdims=True)
-    explained = max(null.chi2 - found.chi2, 0.0)
-    noncentral = rules.precision**2 * float((fringes**2).sum()) + rules.imprecision**2 * explained
-    judged = Judged(found, index, noncentral, block)
+    judged = Judged(found, index, _undescribed(found, null, rules), block)
     return tuple(channel for critic in critics for channel in critic(judged))
+
+
+def _undescribed(found: Hypothesis, null: Hypothesis, rules: Rules, fall: float = 0.0) -> float:
+    """χ² by which the fringes may be described wrongly; ``fall``: what further effects explain."""
+    response = found.point.response
+    fringes = response - response.mean(axis=1, keepdims=True)
+    explained = max(null.chi2 - found.chi2, 0.0) + fall
+    return rules.precision**2 * float((fringes**2).sum()) + rules.imprecision**2 * explained
+
+
+def is_out_of_reach(
+    channels: Sequence[Channel], found: Hypothesis, null: Hypothesis, fall: float, rules: Rules
+) -> bool:
+    """Whether something is left that is no noise, even if further effects take so much off χ².
+
+    What columns explain beside an effect is what they explain without it, less what the effect explains, or more.
+    """
+    noncentral = _undescribed(found, null, rules, fall)
+    return any(
+        chance_beyond(one.statistic - fall, max(one.degrees, 1.0), noncentral) < rules.significance
+        for one in channels
+        if one.name in PROJECTED
+    )
 
 
 def total_chance(channels: Sequence[Channel]) -> float:

@@ -113,6 +113,7 @@ class SetSearch:
         self._joint: dict[frozenset[str], Joint] = {}
         self._added_before: set[tuple[frozenset[str], str]] = set()
         self._short: set[tuple[frozenset[str], str]] = set()  # fits that came far behind before
+        self._brought: dict[str, float] = {}  # most log evidence that an effect brought where it was fitted
 
     def posterior(self, found: Hypothesis) -> float:
         """Log evidence less the price of the effects."""
@@ -121,7 +122,7 @@ class SetSearch:
     def larger(self, best: Hypothesis) -> Hypothesis:
         """The best set with one effect more, or the same where none is surely better."""
         size = len(best.effects) + 1
-        beam = self._of_size(size - 1)[: self.rules.beam] if best.effects else [self.null]
+        beam = self.best_of(size - 1) if best.effects else [self.null]
         self._grow(beam[0])
         for name in best.effects:
             self._exchange_for_two(best, name)
@@ -159,10 +160,6 @@ class SetSearch:
                 self._keep(self._fit(one.effects, one.items, at))
         return self._of_size(len(best.effects))[0]
 
-    def best_of(self, size: int) -> Hypothesis:
-        """The best set of so many effects that is known; there is one of every size below that of the best."""
-        return self._of_size(size)[0]
-
     def best_so_far(self) -> Hypothesis:
         """The best set that is known, none larger than what is surely better."""
         best = self.null
@@ -174,6 +171,7 @@ class SetSearch:
     def on(self, null: Hypothesis) -> SetSearch:
         """The same search of a problem that was judged again; the best sets are fitted from where they are."""
         again = SetSearch(self.catalogue, null, self.rules, self.say, self.leaves_noise, pace=self.pace)
+        again._brought.update(self._brought)
         known = sorted(self.pool.values(), key=self.posterior, reverse=True)
         top = known[0].log_evidence - self.null.log_evidence
         # With one effect of several the noise is still that of a wrong model.
@@ -200,6 +198,14 @@ class SetSearch:
         """Whether a set leaves noise, and no effect promises to be worth its price beside it."""
         promised = max((one.gain for one in self.scores(found)), default=0.0)
         return promised < self.catalogue.price and self.leaves_noise(found)
+
+    def best_of(self, size: int) -> list[Hypothesis]:
+        """The sets of a size that are enlarged, best first; there is one of every size below that of the best."""
+        return self._of_size(size)[: self.rules.beam]
+
+    def hoped(self, one: Scored) -> float:
+        """What an effect may bring: all that it promises and little more, but no more than where it was fitted."""
+        return min(max(one.gain, 0.0) / self.rules.least_of_promise, self._brought.get(one.name, math.inf))
 
     def _is_beaten(self, best: Hypothesis) -> bool:
         """Whether a set of one effect more is surely better."""
@@ -390,8 +396,9 @@ class SetSearch:
             else:
                 found = self._fitted(base, one, names, items)
         self._added_before.add(step)
-        brought = f"promised {one.gain:.1f}, brings {found.log_evidence - base.log_evidence:.1f}"
-        self.say(f"  {'+'.join(names)}: {brought}{self.pace.text}")
+        brings = found.log_evidence - base.log_evidence
+        self._brought[one.name] = max(self._brought.get(one.name, 0.0), brings)
+        self.say(f"  {'+'.join(names)}: promised {one.gain:.1f}, brings {brings:.1f}{self.pace.text}")
         return self._keep(found)
 
     def _fitted(

@@ -26,7 +26,7 @@ from ..preparation import headers_apart
 from ..verdict import Gap, NamedEffect, Verdict
 from ..verdict_words import METRIC, WITHIN_ACCURACY, chance_text, said_of_left_out
 from .accuracy import told_accuracy
-from .critics import judge, state_of, total_chance
+from .critics import is_out_of_reach, judge, state_of, total_chance
 from .heldout import Unseen, judge_unseen
 from .lesson import CellLesson, CellPart, with_corrections
 from .naming import Naming, name_effects
@@ -115,10 +115,27 @@ class MarginalSearch:
         best = self.prepared.null
         for _ in range(self.rules.most_effects):
             size = len(best.effects)
+            if size and all(self._is_out_of_reach(one) for one in self.sets.best_of(size)):
+                self.report(f"no set of {self.rules.most_effects} effects comes near what is left")
+                break
             best = self._judged_again(self.sets.larger(best))
             if len(best.effects) <= size:
                 break
         return best
+
+    def _is_out_of_reach(self, found: Hypothesis) -> bool:
+        """Whether no set that is named leaves noise, if effects bring what derivatives promise, or little more.
+
+        Sets with the members of the best set, or twins of them, are enlarged from there.
+        """
+        scored, best = self.sets.scores(found), self.sets.best_of(len(found.effects))[0]
+        own = [one.signature for one in scored if one.name in best.effects]
+        hoped = sorted(
+            self.sets.hoped(one) + self.sets.catalogue.price + self.rules.class_width for one in scored
+            if all(abs(float(one.signature @ other)) < self.rules.twin_cosine for other in own)
+        )[len(found.effects) - self.rules.most_effects:]  # fmt: skip
+        fall = 2.0 * sum(hoped)
+        return is_out_of_reach(self._channels(found), found, self.prepared.null, fall, self.rules)
 
     def _judged_again(self, best: Hypothesis) -> Hypothesis:
         """The best set once noise and slopes in the cells are those that it leaves itself."""
@@ -301,7 +318,7 @@ class MarginalSearch:
             {"name": one.name, "score": 2.0 * one.gain, "degrees": one.degrees}
             for one in self.sets.scores(null)
         ]
-        rounds = [self.sets.best_of(size) for size in range(1, len(found.effects))]
+        rounds = [self.sets.best_of(size)[0] for size in range(1, len(found.effects))]
         steps = steps_of(prepared, [*rounds, found] if found.effects else [], self._leaves_noise)
         return Verdict(
             word, effects,
