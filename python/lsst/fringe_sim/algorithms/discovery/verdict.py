@@ -313,7 +313,9 @@ class Verdict(InNotebook):
             )
             for entry in content["effects"]
         )
-        where = {key: tuple(v) if isinstance(v, list) else v for key, v in content["where"].items()}
+        where: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in content["where"].items()
+        }
         gap = {key: value if key == "metric" else _number(value) for key, value in content["gap"].items()}
         return cls(
             content["verdict"],
