@@ -19,8 +19,6 @@ from .night_levels import background_terms
 from .sky_model_error import Envelope
 from .smooth_field import Splines
 
-__all__ = ["BACKGROUND", "NightSums", "Slopes"]
-
 PIECE_PX = 128  # Pixels of a piece of a row
 BACKGROUND = 6  # Terms of a background of second degree, in the order of `background_terms`
 

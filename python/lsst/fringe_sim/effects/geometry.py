@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import BoolArray, FloatArray
 from ..errors import InputError, named_units
-
-FloatArray = NDArray[np.float64]
 
 AMPLIFIERS = tuple(f"C{row}{column}" for row in (0, 1) for column in range(8))
 """Amplifiers of an LSST sensor in the order of `ImageGeometry.amplifier`: lower row first, x increasing."""
@@ -108,9 +107,9 @@ class ImageGeometry:
         return unit_place(self.x_px, self.shape[1])[np.newaxis, :]
 
     @property
-    def upper_half(self) -> NDArray[np.bool_]:
+    def upper_half(self) -> BoolArray:
         """Samples above the midline of the sensor, shape ``(ny, 1)``."""
-        upper: NDArray[np.bool_] = (self.y_px >= self.y_edges[1] - 0.5)[:, np.newaxis]
+        upper: BoolArray = (self.y_px >= self.y_edges[1] - 0.5)[:, np.newaxis]
         return upper
 
     @property

@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from ..array_types import BoolArray, FloatArray
 from ..compiled import kernel
-
-FloatArray = NDArray[np.float64]
 
 FARTHEST_PX = 8000.0  # Distance of the centre from the middle of a sensor [px]: the radius of a wafer
 
@@ -75,7 +73,7 @@ class _Samples:
 
 
 def find_rings(
-    image: FloatArray, used: NDArray[np.bool_], y_px: FloatArray, x_px: FloatArray, middle: FloatArray
+    image: FloatArray, used: BoolArray, y_px: FloatArray, x_px: FloatArray, middle: FloatArray
 ) -> Rings | None:
     """The clearest rings in a map, if they are no noise and seen to be bent.
 
@@ -98,14 +96,14 @@ def find_rings(
     )
 
 
-def _samples(image: FloatArray, used: NDArray[np.bool_], y_px: FloatArray, x_px: FloatArray) -> _Samples:
+def _samples(image: FloatArray, used: BoolArray, y_px: FloatArray, x_px: FloatArray) -> _Samples:
     y, x = np.meshgrid(y_px, x_px, indexing="ij")
     cell = float(max(np.diff(y_px).max(initial=1.0), np.diff(x_px).max(initial=1.0)))
     return _Samples(y[used], x[used], image[used] - image[used].mean(), cell)
 
 
 def _averaged(
-    image: FloatArray, used: NDArray[np.bool_], y_px: FloatArray, x_px: FloatArray, factor: int
+    image: FloatArray, used: BoolArray, y_px: FloatArray, x_px: FloatArray, factor: int
 ) -> _Samples:
     """The map averaged over blocks of at least half of which are used."""
     rows, columns = image.shape[0] // factor, image.shape[1] // factor

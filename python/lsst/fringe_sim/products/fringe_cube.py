@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sized
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -135,18 +135,8 @@ class FringeCube(FitsProduct):
     def take(self, index: ArrayLike) -> FringeCube:
         """Cube of the planes at the given positions, in the given order."""
         at = np.asarray(index)
-        return FringeCube(
-            self.image[at],
-            self.variance[at],
-            self.mask[at],
-            self.exposures.take(at),
-            self.unit,
-            self.thickness,
-            self.thickness_sigma,
-            self.layer,
-            self.detector,
-            self.metadata,
-        )
+        image, variance, mask = self.image[at], self.variance[at], self.mask[at]
+        return replace(self, image=image, variance=variance, mask=mask, exposures=self.exposures.take(at))
 
     @classmethod
     @named_units

@@ -313,18 +313,14 @@ class Verdict(InNotebook):
             )
             for entry in content["effects"]
         )
-        where = content["where"]
+        where: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in content["where"].items()
+        }
         gap = {key: value if key == "metric" else _number(value) for key, value in content["gap"].items()}
         return cls(
             content["verdict"],
             effects,
-            Where(
-                tuple(where["wavelength"]),
-                tuple(where["amplifier"]),
-                where["scale_px"],
-                tuple(where["thickness_phase"]),
-                tuple(where["channels"]),
-            ),
+            Where(**where),
             Gap(str(gap.pop("metric")), **gap),
             tuple(Step(**{**step, "added": tuple(step["added"])}) for step in content["steps"]),
             content["unexplained"],

@@ -10,12 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from ...array_types import FloatArray
 from ...effects import Effect
 from .forward import Forward
-
-__all__ = ["Coordinate", "coordinates_of", "log_evidence_of_parameters"]
-
-FloatArray = NDArray[np.float64]
 
 WIDTHS = np.geomspace(1e-3, 30.0, 81)
 """Widths of the distribution of exchangeable parameters, in prior scales, over which the evidence is integrated."""

@@ -8,11 +8,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...array_types import FloatArray
 from ...errors import InputError, OutOfRangeError
-
-__all__ = ["Amplitudes", "core", "native"]
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

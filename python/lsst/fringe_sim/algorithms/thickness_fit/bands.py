@@ -11,8 +11,6 @@ from ...compiled import kernel
 from .amplitudes import Amplitudes, core
 from .templates import LANES
 
-__all__ = ["BAND_ROWS", "gather_pixels", "load_band"]
-
 BAND_ROWS = 8
 """Rows that are loaded at once: all wavelengths of a full sensor then stay in the cache of a processor."""
 _KEEP_APART = 80  # Columns more: rows of 2^n numbers would share the lines of the processor's cache

@@ -18,8 +18,6 @@ from .newton import gauss_newton
 from .pixels import PixelFit
 from .templates import FringeTemplates
 
-__all__ = ["settle_borders"]
-
 _PRICE = 2.0  # Chi-square that a break of half an order or more between two neighbouring pixels costs
 _SWEEPS = 6
 _SAME_SURFACE = 0.25

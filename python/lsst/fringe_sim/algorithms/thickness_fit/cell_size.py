@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from .amplitudes import Amplitudes
 
-__all__ = ["choose_cell_size"]
-
 LARGEST_CELL_PX = 8  # Cells beyond this would wash out the steep fringes of real sensors (9 nm per pixel)
 MOST_CELLS = 600_000  # Bound on the memory of the order evidence: about 84 orders of 4 bytes for each cell
 _FEWEST_CELLS = 64

@@ -21,16 +21,6 @@ from .bands import load_band
 from .medians import middle_of
 from .templates import LANES
 
-__all__ = [
-    "Cells",
-    "average_cells",
-    "cell_edges",
-    "cell_independence",
-    "compensate_slopes",
-    "effective_number",
-    "sample_pixels",
-]
-
 _SPIKE_SIGMA = 6.0  # A row or column of a cell this many standard deviations off its neighbours is thrown out
 _FINEST_PERIOD_PX = 24.0  # Shortest fringe whose curvature is not mistaken for a spike [px]
 _LEAST_CONTRAST = 0.4  # Smallest share of the contrast that a steep cell is taken to keep

@@ -11,8 +11,6 @@ from .learning_cells import LearningCells
 from .nuisances import NuisanceFit, Nuisances
 from .templates import FringeTemplates
 
-__all__ = ["CommonOrder", "rank_orders"]
-
 _MOST_ORDERS = 8
 _CLEAR = 100.0  # Chi-square difference beyond which the orders behind one need not be asked
 _ROUNDS_ELSEWHERE = 6

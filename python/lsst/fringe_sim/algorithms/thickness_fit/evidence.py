@@ -18,16 +18,6 @@ from .cells import Cells
 from .newton import gauss_newton
 from .templates import FringeTemplates, arc_length_nodes
 
-__all__ = [
-    "EVIDENCE_CAP",
-    "IMPOSSIBLE",
-    "MISFIT",
-    "OrderEvidence",
-    "order_evidence",
-    "refine_cells",
-    "refine_row",
-]
-
 NODES_PER_ORDER = 16
 """Templates in one fringe order: the least chi-square from a parabola is then good to 2e-4 of its swing."""
 EVIDENCE_CAP = 30.0

@@ -9,16 +9,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import FloatArray
 from .cells import Cells
 from .learning_cells import some_of
 from .nuisances import NuisanceFit, Nuisances, light_widths, patterns_of_cells
 from .templates import FringeTemplates
-
-__all__ = ["first_nuisances"]
-
-FloatArray = NDArray[np.float64]
 
 _FIRST_CELLS = 20_000
 _INDEPENDENT = 100

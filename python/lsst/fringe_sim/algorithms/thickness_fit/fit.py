@@ -31,8 +31,6 @@ from .silicon import SiliconModel, SiliconSearch
 from .templates import FringeTemplates
 from .uncertainty import lone_slip_probability, slip_probability
 
-__all__ = ["FIT_METHODS", "amplitudes_from_cube", "fit_thickness", "make_templates", "with_observable"]
-
 STEPS_PER_ORDER = 300
 """Template thicknesses in one fringe order: 1 nm of epoxy; linear interpolation is then good to 3e-5 of the swing."""
 FEWEST_WAVELENGTHS = 4

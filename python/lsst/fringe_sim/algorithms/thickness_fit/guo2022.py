@@ -17,8 +17,6 @@ from .amplitudes import Amplitudes
 from .pixels import PixelFit
 from .templates import FringeTemplates
 
-__all__ = ["walk_fit"]
-
 
 def walk_fit(
     data: Amplitudes,

@@ -9,15 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
+from ...array_types import BoolArray, FloatArray
 from ...effects import ImageGeometry
 from ...model import FringeModel, ResponseTable
 from ...products import FringeCube, ThicknessMap, mask_bits
 from ..parabola import parabolic_minimum
 from .rescue import chi2_limits
-
-__all__ = ["fit_islands"]
-
-FloatArray = NDArray[np.float64]
 
 WIDE = 1.6
 """Fringe orders on both sides in which pixels are looked for at first; strong voids break the first fit."""
@@ -57,7 +54,7 @@ def _fit_island(
     outside: FringeModel,
     inside: FringeModel,
     part: FloatArray,
-    usable: NDArray[np.bool_],
+    usable: BoolArray,
 ) -> ThicknessMap:
     order = float(np.mean(outside.fringe_order_um(cube.wavelength_nm)))
     first = np.where(usable | (part == 0.0), fitted.value, np.nan).astype(float)
@@ -123,7 +120,7 @@ class _Pixels:
         return _Found(value, sigma, chi2, used)
 
 
-def _middle_of_neighbours(thickness_um: FloatArray, usable: NDArray[np.bool_]) -> FloatArray:
+def _middle_of_neighbours(thickness_um: FloatArray, usable: BoolArray) -> FloatArray:
     """Median of the pixels about each usable one [µm]; pixels without a number do not count."""
     reach = np.arange(-NEIGHBOURS, NEIGHBOURS + 1)
     rows, columns = np.nonzero(usable)
@@ -142,7 +139,7 @@ def _joining_shift(
     inside: FringeModel,
     wavelength_nm: FloatArray,
     part: FloatArray,
-    usable: NDArray[np.bool_],
+    usable: BoolArray,
     order: float,
 ) -> float:
     """Shift of the thickness on the island: what the phases of both optics differ by, and whole orders [µm]."""

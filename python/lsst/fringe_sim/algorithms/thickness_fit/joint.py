@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import FloatArray
 from ...compiled import kernel, run_threaded, subkernel
 from .amplitudes import Amplitudes
 from .bands import BAND_ROWS, gather_pixels, load_band
@@ -27,10 +28,6 @@ from .silicon import (
 )
 from .templates import FringeTemplates
 from .uncertainty import slip_probability
-
-__all__ = ["JointFit", "joint_fit"]
-
-FloatArray = NDArray[np.float64]
 
 _STEPS = 3
 _LONGEST = 0.1

@@ -7,15 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import FloatArray
 from .amplitudes import Amplitudes
 from .bands import gather_pixels
 from .cells import Cells, effective_number
 from .nuisances import Nuisances, light_patterns, patterns_of_cells
 from .pixels import CellSurface
-
-__all__ = ["LearningCells", "sample_blocks", "some_of"]
-
-FloatArray = NDArray[np.float64]
 
 _MOST_CELLS = 3_000
 _MOST_BLOCKS = 6_000

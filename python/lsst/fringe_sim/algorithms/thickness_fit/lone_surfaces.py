@@ -16,8 +16,6 @@ from .cells import Cells
 from .evidence import IMPOSSIBLE, OrderEvidence, order_evidence, refine_cells
 from .templates import FringeTemplates
 
-__all__ = ["LoneSurfaces", "settle_lone_surfaces"]
-
 
 @dataclass(frozen=True, eq=False)
 class LoneSurfaces:

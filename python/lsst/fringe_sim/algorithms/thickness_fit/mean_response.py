@@ -11,8 +11,6 @@ from .evidence import refine_cells
 from .pixels import CellSurface
 from .templates import FringeTemplates
 
-__all__ = ["SENSOR_ORDERS", "normalise_to_cells", "normalise_to_pixels", "spans_orders"]
-
 _MEAN_TOLERANCE = 2e-6
 """Relative change of the mean response that is left alone: far below the noise of a smoothed flat."""
 _MOST_ROUNDS = 20

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from ...compiled import subkernel
 
-__all__ = ["middle_of"]
-
 
 @subkernel
 def _sort_first(values, count):  # type: ignore[no-untyped-def]

@@ -15,12 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from ...array_types import FloatArray
 from ...compiled import subkernel
 from .templates import FringeTemplates
-
-__all__ = ["Misfit", "improbability", "judge_cells", "shared_variances"]
-
-FloatArray = NDArray[np.float64]
 
 _TAILS = np.geomspace(2.0, 1024.0, 10)
 """Degrees of freedom that are tried; the likelihood changes little from one to the next."""

@@ -22,14 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import FloatArray
 from ...compiled import kernel, run_threaded, subkernel
 from .cells import Cells
 from .evidence import refine_row
 from .templates import FringeTemplates, pad_wavelengths
-
-__all__ = ["NarrowSensor", "is_own_mean", "settle_narrow_sensor"]
-
-FloatArray = NDArray[np.float64]
 
 _MOST_CELLS = 600  # Cells that are asked; more would only add certainty
 _FEW_CELLS = 120  # Cells with which all starts are compared; only the best of these go on with more

@@ -10,8 +10,6 @@ import numpy as np
 
 from ...compiled import subkernel
 
-__all__ = ["gauss_newton", "newton_block", "score"]
-
 _TINY = np.float32(1e-30)
 _CLOSE = np.float32(1.5)
 """A second step shorter than this, in steps of a table with 300 per order, leaves nothing to a third."""

@@ -31,8 +31,6 @@ from ...compiled import kernel, subkernel
 from .cells import Cells
 from .evidence import IMPOSSIBLE, OrderEvidence
 
-__all__ = ["solve_orders"]
-
 SURE = 60.0
 """Chi-square difference between the best and the next order at which a region is sure of its order."""
 

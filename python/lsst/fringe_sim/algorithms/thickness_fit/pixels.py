@@ -20,8 +20,6 @@ from .medians import middle_of
 from .newton import gauss_newton, newton_block
 from .templates import FringeTemplates
 
-__all__ = ["CellSurface", "PixelFit", "bracket", "calm_surface", "fit_pixels"]
-
 _STEPS = 5  # Most Gauss-Newton steps; two are usual
 _LONGEST_STEP = 0.1  # Longest Gauss-Newton step, in fringe orders
 SAME_SURFACE = 0.25

@@ -15,17 +15,6 @@ from ...compiled import kernel
 from .newton import score
 from .templates import FringeTemplates
 
-__all__ = [
-    "NODES",
-    "REACH",
-    "SHARE",
-    "chi2_about",
-    "nodes_about",
-    "settle_band",
-    "share_apart",
-    "widest_parabola",
-]
-
 _CHANGE = 0.25
 """Relative change of the information within three standard deviations up to which the likelihood is a parabola: its
 uncertainty is then good to a tenth."""

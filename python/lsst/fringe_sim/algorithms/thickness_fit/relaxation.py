@@ -22,8 +22,6 @@ from .misfit import Misfit, improbability, judge_cells
 from .newton import gauss_newton
 from .templates import FringeTemplates
 
-__all__ = ["SettledCells", "settle_orders"]
-
 SHIFTS = 3  # Orders above and below that are tried in one round
 BREAK_PRICE = 8.0  # Chi-square that a break of half an order or more between two neighbouring cells costs
 SAME_SURFACE = 0.25  # Cells that agree within this many orders, slopes allowed for, lie on one surface

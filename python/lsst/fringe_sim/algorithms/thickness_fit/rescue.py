@@ -20,8 +20,6 @@ from .newton import gauss_newton
 from .pixels import PixelFit
 from .templates import FringeTemplates
 
-__all__ = ["SUSPECT_PROBABILITY", "chi2_limits", "rescue_pixels", "typical_misfit"]
-
 SUSPECT_PROBABILITY = 1e-7  # A pixel whose chi-square is that improbable is not believed
 _FEWEST_TO_SPARE = 6  # A wavelength is left out only of so many or more
 _COMPACT = 0.5

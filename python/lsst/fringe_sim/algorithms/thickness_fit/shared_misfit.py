@@ -17,8 +17,6 @@ from .evidence import refine_row
 from .pixels import CellSurface
 from .templates import FringeTemplates
 
-__all__ = ["cells_leave_only_noise", "doubt_from_shared_misfit", "leaves_only_noise"]
-
 _MOST_PIXELS = 4000
 _MOST_PAIRS = 40_000
 _SHIFTS = (-3, -2, -1, 1, 2, 3)  # Orders from the solution with which the shared misfit is compared

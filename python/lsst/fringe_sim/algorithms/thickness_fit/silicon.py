@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from ...array_types import BoolArray, FloatArray
 from ...compiled import kernel
 from ...effects.geometry import unit_place
 from ...errors import InputError, OutOfRangeError
@@ -46,8 +47,6 @@ __all__ = [
     "silicon_free",
     "silicon_map",
 ]
-
-FloatArray = NDArray[np.float64]
 
 OFFSET = "silicon_thickness.offset"
 _SCAN_PER_ORDER = 12
@@ -544,7 +543,7 @@ def _shifted_sum(curves: FloatArray, shift: FloatArray) -> FloatArray:
 def _minima(
     scans: list[tuple[FloatArray, FloatArray]],
     offsets: FloatArray,
-    usable: NDArray[np.bool_],
+    usable: BoolArray,
     terms: int,
 ) -> list[FloatArray]:
     """Best local minima over the mean offset, each with its best tilt."""

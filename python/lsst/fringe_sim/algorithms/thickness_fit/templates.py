@@ -9,11 +9,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...array_types import FloatArray
 from ...errors import InputError, OutOfRangeError
-
-__all__ = ["FringeTemplates", "arc_length_nodes"]
-
-FloatArray = NDArray[np.float64]
 
 LANES = 8  # Wavelength axes are padded to a multiple of this, so that inner loops fill the vector registers
 

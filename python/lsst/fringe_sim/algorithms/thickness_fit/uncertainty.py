@@ -12,8 +12,6 @@ from .global_fit import GlobalFit
 from .newton import gauss_newton
 from .templates import FringeTemplates
 
-__all__ = ["lone_slip_probability", "slip_probability"]
-
 _SHIFTS = 4  # Orders on both sides that a lone pixel is compared with
 
 

@@ -11,11 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = ["CommonError", "common_error", "shift_precision", "spread_of_wavelengths"]
-
-FloatArray = NDArray[np.float64]
+from ...array_types import FloatArray
 
 _LEAST_SHIFT_NM = 0.02  # Least standard deviation of the wavelengths: that of a calibrated monochromator
 _TAIL = 6.0  # Degrees of freedom of Student's distribution: now and then a wavelength is far off

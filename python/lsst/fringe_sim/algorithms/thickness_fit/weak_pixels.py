@@ -15,8 +15,6 @@ from .pixels import CellSurface, PixelFit
 from .posterior import NODES, SHARE, chi2_about, nodes_about, settle_band, share_apart, widest_parabola
 from .templates import FringeTemplates
 
-__all__ = ["settle_weak_pixels"]
-
 _MOST_ASKED = 8192  # Pixels that show how many lie apart from their surface
 
 

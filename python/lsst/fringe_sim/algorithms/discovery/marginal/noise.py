@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....array_types import BoolArray, FloatArray
 from ...inference import Point
-
-__all__ = ["measured_noise", "neighbour_scatter"]
-
-FloatArray = NDArray[np.float64]
 
 FEWEST = 60
 """Second differences from which a noise level is taken; with fewer the stated one is believed, as before."""
@@ -40,7 +36,7 @@ def measured_noise(point: Point, shape: tuple[int, int, int]) -> tuple[FloatArra
     return factor, float(np.sqrt(max(scatter2, 0.0)))
 
 
-def neighbour_scatter(field: FloatArray, seen: NDArray[np.bool_], stated: float) -> float:
+def neighbour_scatter(field: FloatArray, seen: BoolArray, stated: float) -> float:
     """Standard deviation of what neighbours of a field ``(ny, nx)`` do not share; the stated one if there are few."""
     if min(field.shape) < 3:
         return stated
@@ -74,6 +70,6 @@ def _mean_of_nine(image: FloatArray) -> FloatArray:
     return np.asarray((rows[:, :, :-2] + 4.0 * rows[:, :, 1:-1] + rows[:, :, 2:]) / 36.0)
 
 
-def _nine(good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _nine(good: BoolArray) -> BoolArray:
     rows = good[:, :-2] & good[:, 1:-1] & good[:, 2:]
     return np.asarray(rows[:, :, :-2] & rows[:, :, 1:-1] & rows[:, :, 2:])
