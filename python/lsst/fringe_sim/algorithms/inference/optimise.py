@@ -257,9 +257,7 @@ def _tolerance(point: Point, aim: float, least: float) -> float:
     return max(least, LEAST_PART * (point.cost - aim))
 
 
-def _walked(
-    items: Sequence[Coordinate], point: Point, rounds: int, aim: float, least: float
-) -> Point:
+def _walked(items: Sequence[Coordinate], point: Point, rounds: int, aim: float, least: float) -> Point:
     """The same without going back."""
     for _ in range(rounds):
         columns = point.level_columns
