@@ -5,7 +5,7 @@ asked on the surface that its neighbours show and not where it was found: there 
 surface, and how surely. Surfaces and cells are settled in turn.
 
 A step or a ridge is no surface of second degree: there all cells about a place leave over more than their noise,
-though hardly one of them does by itself. How much more is weighed against what the cells about other places leave over.
+though hardly one of them does by itself. How much more is weighed against what other windows leave over.
 """
 
 from __future__ import annotations
@@ -165,13 +165,16 @@ def _allow_for_misfit(found: LocalSurface, asked: NDArray[np.bool_], misfit: Flo
     chi2, precision = misfit
     if chi2.size == 0:
         return
-    chi2 = chi2 / max(float(np.median(chi2)) / _MEDIAN, 1.0)  # of all cells, pixels tell how far they lie off
+    common = max(float(np.median(chi2)) / _MEDIAN, 1.0)  # of all cells, pixels tell how far they lie off
+    chi2 = chi2 / common
     log = -0.5 * (_FREEDOM * np.log(_FACTORS) + chi2[:, None] / _FACTORS)
     likely = np.exp(log - log.max(axis=1, keepdims=True))
     some = likely[:: -(-chi2.size // _MOST_WINDOWS)]
     factor = responsibility(likely, most_likely_shares(some, np.ones(_FACTORS.size))) @ _FACTORS
-    variance = factor * found.sigma_um[asked].astype(float) ** 2
-    found.sigma_um[asked] = np.sqrt(variance + (factor - 1.0) / np.maximum(precision, 1e-30))
+    variance = factor * found.sigma_um[asked].astype(float) ** 2 + (factor - 1.0) / np.maximum(
+        precision, 1e-30
+    )
+    found.sigma_um[asked] = np.sqrt(common * variance)
 
 
 def shares_of_middle(
