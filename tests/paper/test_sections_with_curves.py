@@ -31,7 +31,7 @@ SMALLER = {
     (coadds, "TREECORR_PX"): 24,
     (optics, "PATH_RAYS"): 4,
     (optics, "BINS"): (10, 50),
-    (optics, "BEAM_NODES"): 64,
+    (optics, "BEAM_NODES"): 24,
 }
 """What takes long, smaller."""
 
