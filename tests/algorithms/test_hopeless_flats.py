@@ -27,6 +27,13 @@ def without_good_pixels() -> FringeCube:
     return replace(cube, mask=np.full(cube.shape, mask_bits("BAD"), np.int16))
 
 
+def with_two_good_pixels() -> FringeCube:
+    cube = without_good_pixels()
+    mask = np.array(cube.mask)
+    mask[:, 3, 4] = mask[:, 8, 13] = 0
+    return replace(cube, mask=mask)
+
+
 def of_noise() -> FringeCube:
     cube = flats(16, 20)
     noise = 1.0 + 0.3 * np.random.default_rng(4).standard_normal(cube.shape)
@@ -38,8 +45,8 @@ def of_noise() -> FringeCube:
 
 @pytest.mark.parametrize(
     "make",
-    [of_noise, lambda: flats(24, 1), lambda: flats(3, 5)],
-    ids=["noise", "one column", "few pixels"],
+    [of_noise, with_two_good_pixels, lambda: flats(24, 1), lambda: flats(3, 5)],
+    ids=["noise", "two good pixels", "one column", "few pixels"],
 )
 def test_hopeless_flats_are_as_recorded(make, recorded: Record) -> None:
     found = fit_thickness(make(), FringeModel.from_setup("ts8_e2v"))

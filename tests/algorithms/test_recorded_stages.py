@@ -120,7 +120,7 @@ def test_a_map_from_a_range_is_as_recorded(recorded: Record) -> None:
 def test_a_fit_of_smoothed_flats_is_as_recorded(recorded: Record) -> None:
     """Their pixels share noise, so that a hundred of them tell less than a hundred that do not."""
     rng = np.random.default_rng(5)
-    cube, _ = expose(foreign_map(rng, (32, 36), 14.0, 14.9), {}, rng)
+    cube, _ = expose(foreign_map(rng, (24, 28), 14.0, 14.7), {}, rng)
     noise = rng.standard_normal(cube.shape) * np.sqrt(cube.variance)
     smooth = gaussian_filter(noise, (0.0, 1.3, 1.3))
     noisy = cube.image + smooth * noise.std() / smooth.std()

@@ -5,6 +5,7 @@ The published ones do not belong to the package; whether the numbers of the pape
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ SMALLER = {
     (coadds, "TREECORR_PX"): 24,
     (optics, "PATH_RAYS"): 4,
     (optics, "BINS"): (10, 50),
-    (optics, "BEAM_NODES"): 64,
+    (optics, "BEAM_NODES"): 24,
 }
 """What takes long, smaller."""
 
@@ -105,3 +106,27 @@ def test_a_section_is_as_recorded(
     for (module, name), value in SMALLER.items():
         monkeypatch.setattr(module, name, value)
     recorded(compute(context))
+
+
+class OneWave:
+    """Stands in the place of a response that takes seconds: a wave that depends on all that it is asked for."""
+
+    def __init__(self, model: Any, spectrum: Any, thickness_range_um: tuple[float, float]) -> None:
+        self.low, self.high = thickness_range_um
+        self.size = 0.01 * spectrum.airmass * len(spectrum.lines.wavelength_nm) ** 0.1
+
+    def sky(self) -> OneWave:
+        return self
+
+    def lookup(self, layer_um: np.ndarray) -> tuple[np.ndarray]:
+        return (1.0 + wave(np.asarray(layer_um) - self.low, 0.15 * (self.high - self.low), self.size),)
+
+
+@pytest.mark.parametrize("published", [True, False])
+def test_a_section_on_hsc_with_another_response_is_as_recorded(
+    published: bool, context: Context, recorded: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for (module, name), value in SMALLER.items():
+        monkeypatch.setattr(module, name, value)
+    monkeypatch.setattr(sky, "sky_response", OneWave)
+    recorded(sky.hsc(context if published else replace(context, shared=None)))

@@ -16,7 +16,7 @@ from lsst.fringe_sim.challenge.sealed_cases import expose
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.model import FringeModel
 
-NAMES = ("silicon_thickness", "contrast_loss", "bandwidth", "ghost_pedestal")
+NAMES = ("silicon_thickness", "contrast_loss", "bandwidth", "ghost_pedestal", "amplifier_gain")
 HIDDEN = {"silicon_thickness.offset": 0.05, "contrast_loss.factor": 0.95}
 
 
@@ -51,7 +51,8 @@ def test_sets_of_a_small_sensor_are_as_recorded(prepared: Prepared, recorded: Re
     selector = selector_of(prepared)
     one = selector.hypothesis(("silicon_thickness",))
     settled = selector.settled(one)
-    pairs = likely_pairs(selector, prepared.null, NAMES[1:])
+    pairs = likely_pairs(selector, prepared.null, NAMES)
+    assert {name for pair in pairs for name in pair.names} == set(NAMES) - {"amplifier_gain"}  # it has many
     both = fitted_pair(selector, selector.null, pairs[0])
     assert pairs[0].gain == pytest.approx(prepared.null.chi2 - both.fit.chi2, rel=0.3)
     recorded({
@@ -61,6 +62,22 @@ def test_sets_of_a_small_sensor_are_as_recorded(prepared: Prepared, recorded: Re
         "ends": selector.at_end_of_range(both.fit),
         "spots": [selector.evidence_of_spots(each) for each in (one, both)],
     })  # fmt: skip
+
+
+def test_a_set_with_an_island_is_as_recorded(recorded: Record) -> None:
+    rng = np.random.default_rng(12)
+    void = {"void.centre_x": 17.6, "void.centre_y": 13.4, "void.radius": 7.0, "void.thickness": 190.0}
+    cube, _ = expose(foreign_map(rng, (28, 32), 14.0, 14.7), void, rng)
+    known = [one for one in EFFECTS if one.name == "void"]
+    prepared = prepare(cube, FringeModel.from_setup("ts8_e2v"), known, 20_000)
+    selector = Selector(
+        prepared.problem, known, prepared.null, prepared.index, first_field=prepared.null.field
+    )
+    starts = selector.score(prepared.null, ["void"])
+    found = selector.hypothesis(("void",))
+    for key, value in void.items():
+        assert found.fit.settings[key] == pytest.approx(value, rel=0.03), key
+    recorded({"starts": [(one.gain, one.promise, one.start) for one in starts], "found": told(found)})
 
 
 def test_few_pixels_are_judged_by_all_their_values(prepared: Prepared) -> None:

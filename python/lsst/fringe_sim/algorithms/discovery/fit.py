@@ -768,8 +768,7 @@ class _Solver:
             step, field_step = design.step(point.residual, ridge + extra, pull)
             position = point.position + step[levels:]
             clipped = np.array([c.clip(x) for c, x in zip(self.coordinates, position, strict=True)])
-            outside = np.abs(clipped - position) > 1e-12 + 1e-6 * np.abs(position)
-            at_bound = np.concatenate([np.zeros(levels, bool), outside & (clipped == point.position)])
+            at_bound = np.concatenate([np.zeros(levels, bool), clipped == point.position])
             if np.any(at_bound & ~held):
                 held |= at_bound
                 continue

@@ -107,8 +107,11 @@ def typical_misfit(pixels: PixelFit) -> float:
     # An odd stride does not fall on the same columns in every row.
     for stride in (pixels.chi2.size // _SAMPLE | 1, 1):
         chi2 = pixels.chi2.ravel()[::stride][pixels.n_wavelengths.ravel()[::stride] == most]
+        chi2 = chi2[np.isfinite(chi2)]
         if chi2.size > 0:
             break
+    else:
+        return 1.0
     expected = chdtri(most - 1, 0.5) / (most - 1)
     return max(float(np.median(chi2)) / expected, 1.0)
 
