@@ -16,7 +16,12 @@ import pytest
 from lsst.fringe_sim import compiled
 from lsst.fringe_sim.cli.progress import progress
 from lsst.fringe_sim.compiled import kernel, limit_threads, processors, run_shares, run_threaded, subkernel
-from lsst.fringe_sim.descriptions import Description, files_of, is_file_name, with_files_beside
+from lsst.fringe_sim.descriptions import (
+    Description,
+    files_of,
+    is_file_name,
+    with_files_beside,
+)
 from lsst.fringe_sim.errors import (
     InputError,
     UnknownNameError,
@@ -27,7 +32,13 @@ from lsst.fringe_sim.errors import (
     without_unit,
 )
 from lsst.fringe_sim.notebook import OneLine
-from lsst.fringe_sim.resources import DEEPEST_NESTING, LONGEST_USER_FILE, parse_user_yaml, read_user_text
+from lsst.fringe_sim.resources import (
+    DEEPEST_NESTING,
+    LONGEST_USER_FILE,
+    number_of_values,
+    parse_user_yaml,
+    read_user_text,
+)
 
 
 def test_long_texts_are_shortened_in_the_middle() -> None:
@@ -89,6 +100,22 @@ def test_masks_and_units() -> None:
 
 
 # Descriptions
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "step", "number"),
+    [
+        (880.0, 990.0, 10.0, 12),
+        (880.0, 989.9, 10.0, 11),
+        (0.0, 0.3, 0.1, 4),
+        (5.0, 5.0, 1.0, 1),
+        (0.0, 1.0, 0.4, 3),
+    ],
+)
+def test_a_range_has_its_last_value_if_steps_lead_there(
+    first: float, last: float, step: float, number: int
+) -> None:
+    assert number_of_values(first, last, step) == number
 
 
 def of(**content: Any) -> Description:

@@ -4,11 +4,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from product_makers import components
 
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.products import SkyFringe, mask_bits
 from lsst.fringe_sim.tasks import FringePcaConfig, FringePcaTask
-from lsst.fringe_sim.tasks.fringe_pca import FringePcaConnections
+from lsst.fringe_sim.tasks.fringe_pca import FringePcaConnections, _above
 
 ROWS, COLUMNS = 20, 30
 CREATED = "2026-11-21T03:43:40"
@@ -96,3 +97,16 @@ def test_the_template_can_be_registered_as_afw_wants_it() -> None:
     assert (own.fringe.storageClass, afw.fringe.storageClass) == ("FringeFrame", "ExposureF")
     assert own.fringe.isCalibration
     assert afw.fringe.isCalibration
+
+
+@pytest.mark.parametrize(("least_rms", "kept"), [(0.0, 2), (0.005, 2), (0.0051, 1), (0.01, 1), (0.5, 1)])
+def test_components_that_add_little_are_left_out(least_rms: float, kept: int) -> None:
+    """By what each adds to a good pixel of a typical frame; the first stays in any case."""
+    mask = np.zeros((3, 4), np.int32)
+    mask[0, :2] = mask_bits("NO_DATA")
+    made = components(mask=mask, explained_variance=10 * np.array([0.01, 0.00500001]) ** 2)
+    found = _above(made, least_rms)
+    np.testing.assert_array_equal(found.components, made.components[:kept])
+    np.testing.assert_array_equal(found.scores, made.scores[:, :kept])
+    assert found.explained_variance.tolist() == made.explained_variance[:kept].tolist()
+    assert found.explained_variance_ratio.tolist() == made.explained_variance_ratio[:kept].tolist()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import itertools
+import math
 import os
 import re
 import warnings
@@ -219,6 +220,14 @@ def _check_events(text: str, what: str, source: str | None) -> None:
             depth -= 1
         if depth > DEEPEST_NESTING:
             raise InputError(what, f"nested {depth} deep", f"up to {DEEPEST_NESTING}", source=source)
+
+
+_ROUNDING = 1e-9  # of a number of steps
+
+
+def number_of_values(first: float, last: float, step: float) -> int:
+    """How many values ``first:last:step`` stands for; the last one is among them if the steps lead there."""
+    return math.floor((last - first) / step + _ROUNDING) + 1
 
 
 def first_line(error: Exception) -> str:

@@ -6,7 +6,6 @@ What a conversion needs is imported by it, so that help and complaints about usa
 from __future__ import annotations
 
 import functools
-import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -67,11 +66,13 @@ class _Wavelengths(click.ParamType):
             return value
         quantity = Quantity("nm")
         if ":" in value:
+            from ..resources import number_of_values
+
             parts = [quantity.convert(part, param, ctx) for part in value.split(":")]
             if len(parts) != 3 or parts[2] <= 0.0 or parts[1] < parts[0]:
                 self.fail(f"{value!r} is not first:last:step with first <= last and step > 0", param, ctx)
             first, last, step = parts
-            count = math.floor((last - first) / step + 1e-9) + 1
+            count = number_of_values(first, last, step)
             if count > 1000:
                 self.fail(f"{value!r} asks for {count} wavelengths; at most 1000", param, ctx)
             return tuple(float(first + i * step) for i in range(count))

@@ -19,6 +19,7 @@ from lsst.daf.butler import Butler, Timespan
 from lsst.daf.butler.registry import ConflictingDefinitionError
 
 from ..errors import InputError, OutOfRangeError, UnknownNameError
+from ..resources import number_of_values
 from .instruments import INSTRUMENTS, FringeInstrument
 
 SIMULATED_YEARS = 50_000_000
@@ -63,8 +64,7 @@ def parse_hours(text: str) -> tuple[float, ...]:
     if len(parts) != 3 or not all(map(math.isfinite, parts)) or parts[2] <= 0 or parts[1] < parts[0]:
         raise InputError("hours", text, allowed)
     first, last, step = parts
-    count = math.floor((last - first) / step + 1e-9) + 1
-    return tuple(float(hour) for hour in first + step * np.arange(count))
+    return tuple(float(hour) for hour in first + step * np.arange(number_of_values(first, last, step)))
 
 
 def hour_of_night(record: Any) -> float:

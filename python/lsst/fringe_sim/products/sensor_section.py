@@ -115,8 +115,7 @@ class SensorSection:
         """
         if len(shape) < 2 or min(shape) < 1:
             raise InputError("shape of the image", shape, "two or more axes, all positive")
-        ends = (self.x, self.y)
-        steps = [_step(*both) for both in zip(ends, (shape[-1], shape[-2]), strict=True)]
+        steps = [_step(self.x, shape[-1]), _step(self.y, shape[-2])]
         cards = fits.Header()
         for key, name in (("D", "DETECTOR"), ("F", "FOCAL PLANE")):
             cards[f"WCSAXES{key}"], cards[f"WCSNAME{key}"] = len(shape), name
