@@ -27,7 +27,6 @@ from lsst.fringe_sim.model import FringeModel, Setup
 
 FLATS = tuple(float(nm) for nm in range(880, 1000, 10))
 NARROW = FlatMeasurement("narrow", "0.5 nm", FlatSeries(FLATS, bandwidth_fwhm_nm=0.5))
-SECOND_F = FlatMeasurement("f", "f/2", FlatSeries(FLATS, f_number=2.0))
 BRIGHT = FlatMeasurement("level", "80 000 e", FlatSeries(FLATS, 80_000.0))
 WIDE = FlatMeasurement("wide", "wider", FlatSeries((*np.linspace(800, 870, 8), *np.linspace(1000, 1050, 6))))
 AGAIN = FlatMeasurement("again", "again", FlatSeries(FLATS))

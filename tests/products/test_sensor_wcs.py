@@ -6,17 +6,12 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from product_makers import thickness
 
-from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.products import SensorSection, ThicknessMap
 
 CAMERA = Camera.from_name("lsstCam")
 MM_PER_DEG = 180.2
 """Effective focal length of 10.31 m; distortion and refraction change it by half a percent over the field."""
-
-
-def corners(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    return np.array([0.0, shape[1] - 1.0]), np.array([0.0, shape[0] - 1.0])
 
 
 @pytest.mark.parametrize("name", ["R22_S11", "R11_S01", "R43_S21"])
@@ -87,8 +82,3 @@ def test_a_product_keeps_its_numbers_and_its_checksums(tmp_path) -> None:
         assert all(WCS(hdu.header, key="F").wcs.name == "FOCAL PLANE" for hdu in images)
         assert all("updated" not in hdu.header.comments["CHECKSUM"] for hdu in hdus), "no time of day"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_an_image_without_pixels_is_refused() -> None:
-    with pytest.raises(InputError, match="shape of the image"):
-        SensorSection.whole(CAMERA.detector("R22_S11")).cards((0, 4))

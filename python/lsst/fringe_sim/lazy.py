@@ -7,6 +7,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 
+def homes(**names: str) -> dict[str, str]:
+    """The module of each name, relative to its package; given are the names in each module, between blanks."""
+    return {name: f".{module}" for module, listed in names.items() for name in listed.split()}
+
+
 def on_first_use(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
     """``__getattr__`` of a package whose names are in the modules ``homes``, relative to it."""
 

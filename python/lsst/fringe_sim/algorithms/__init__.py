@@ -5,22 +5,19 @@ The public functions are imported on first use, because some of them bring heavy
 
 from __future__ import annotations
 
-from ..lazy import on_first_use
+from ..lazy import homes, on_first_use
 
-_LAZY = {
-    "coadd_correlation": ".image_correlation",
-    "combine_biases": ".flat_prep",
-    "correct_fringes": ".fringe_correction",
-    "discover": ".discovery",
-    "fit_pca": ".pca",
-    "fit_single_pixel": ".single_pixel",
-    "fit_thickness": ".thickness_fit",
-    "forecast_flats": ".flat_plan",
-    "prepare_flat": ".flat_prep",
-    "rank_flats": ".flat_plan",
-    "recommend_flats": ".flat_plan",
-    "simulate_sky_frame": ".sky_frame",
-}
+_LAZY = homes(
+    discovery="discover",
+    flat_plan="forecast_flats rank_flats recommend_flats",
+    flat_prep="combine_biases prepare_flat",
+    fringe_correction="correct_fringes",
+    image_correlation="coadd_correlation",
+    pca="fit_pca",
+    single_pixel="fit_single_pixel",
+    sky_frame="simulate_sky_frame",
+    thickness_fit="fit_thickness",
+)
 
 __all__ = sorted(_LAZY)  # pyright: ignore[reportUnsupportedDunderAll]
 __getattr__ = on_first_use(__name__, _LAZY)

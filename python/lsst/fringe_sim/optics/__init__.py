@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..lazy import on_first_use
+from ..lazy import homes, on_first_use
 
 if TYPE_CHECKING:
     from .illumination import Beam as Beam
@@ -24,21 +24,13 @@ if TYPE_CHECKING:
     from .stack import LayerStack as LayerStack
     from .transfer_matrix import layer_absorption as layer_absorption
 
-_LAZY = {
-    "Beam": ".illumination",
-    "Illumination": ".illumination",
-    "LampSpectrum": ".illumination",
-    "Layer": ".stack",
-    "LayerStack": ".stack",
-    "Medium": ".media",
-    "PhaseResponse": ".phase_response",
-    "SpectralProfile": ".illumination",
-    "constant_medium": ".media",
-    "get_medium": ".media",
-    "layer_absorption": ".transfer_matrix",
-    "medium_names": ".media",
-    "reduce_to_phase": ".phase_response",
-}
+_LAZY = homes(
+    illumination="Beam Illumination LampSpectrum SpectralProfile",
+    media="Medium constant_medium get_medium medium_names",
+    phase_response="PhaseResponse reduce_to_phase",
+    stack="Layer LayerStack",
+    transfer_matrix="layer_absorption",
+)
 
 __all__ = sorted(_LAZY)  # pyright: ignore[reportUnsupportedDunderAll]
 __getattr__ = on_first_use(__name__, _LAZY)

@@ -5,41 +5,26 @@ Each is imported on first use. Importing this package makes the storage classes 
 
 from __future__ import annotations
 
-from ..lazy import on_first_use
+from ..lazy import homes, on_first_use
 from ..middleware import register_storage_classes
 
 register_storage_classes()
 
-_LAZY = {
-    "EffectDiscoveryConfig": ".effect_discovery",
-    "EffectDiscoveryTask": ".effect_discovery",
-    "EpoxyFitConfig": ".epoxy_fit",
-    "EpoxyFitTask": ".epoxy_fit",
-    "FocalPlaneSummaryConfig": ".focal_plane_summary",
-    "FocalPlaneSummaryTask": ".focal_plane_summary",
-    "FringeBiasConfig": ".fringe_bias",
-    "FringeBiasTask": ".fringe_bias",
-    "FringeCorrectionConfig": ".fringe_correction",
-    "FringeCorrectionTask": ".fringe_correction",
-    "FringeForecastConfig": ".fringe_forecast",
-    "FringeForecastTask": ".fringe_forecast",
-    "FringeModelConfig": ".model_config",
-    "FringePcaConfig": ".fringe_pca",
-    "FringePcaTask": ".fringe_pca",
-    "IsrFlatPrepConfig": ".isr_flat_prep",
-    "IsrFlatPrepTask": ".isr_flat_prep",
-    "MapTemplatesConfig": ".map_templates",
-    "MapTemplatesTask": ".map_templates",
-    "ObservedFringeConfig": ".observed_fringe",
-    "ObservedFringeTask": ".observed_fringe",
-    "RaftConfig": ".model_config",
-    "SensorConfig": ".model_config",
-    "SkyEffectDiscoveryConfig": ".effect_discovery",
-    "SkyEffectDiscoveryTask": ".effect_discovery",
-    "SkyFringeSimConfig": ".sky_fringe_sim",
-    "SkyFringeSimTask": ".sky_fringe_sim",
-    "UnusableDataError": ".quantum",
-}
+_LAZY = homes(
+    effect_discovery="EffectDiscoveryConfig EffectDiscoveryTask SkyEffectDiscoveryConfig SkyEffectDiscoveryTask",
+    epoxy_fit="EpoxyFitConfig EpoxyFitTask",
+    focal_plane_summary="FocalPlaneSummaryConfig FocalPlaneSummaryTask",
+    fringe_bias="FringeBiasConfig FringeBiasTask",
+    fringe_correction="FringeCorrectionConfig FringeCorrectionTask",
+    fringe_forecast="FringeForecastConfig FringeForecastTask",
+    fringe_pca="FringePcaConfig FringePcaTask",
+    isr_flat_prep="IsrFlatPrepConfig IsrFlatPrepTask",
+    map_templates="MapTemplatesConfig MapTemplatesTask",
+    model_config="FringeModelConfig RaftConfig SensorConfig",
+    observed_fringe="ObservedFringeConfig ObservedFringeTask",
+    quantum="UnusableDataError",
+    sky_fringe_sim="SkyFringeSimConfig SkyFringeSimTask",
+)
 
 __all__ = sorted(_LAZY)  # pyright: ignore[reportUnsupportedDunderAll]
 __getattr__ = on_first_use(__name__, _LAZY)
