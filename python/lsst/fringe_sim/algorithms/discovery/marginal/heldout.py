@@ -23,7 +23,7 @@ from .lesson import (
 )
 from .preparation import Prepared
 
-__all__ = ["StandIn", "Unseen", "judge_unseen", "stand_in"]
+__all__ = ["StandIn", "Unseen", "judge_unseen", "rms_unseen", "stand_in"]
 
 FloatArray = NDArray[np.float64]
 
@@ -67,6 +67,15 @@ class Unseen:
         """One line for the notes."""
         other = f", with {self.stand_in} of equal size by {self.stand_in_gain:.1f}" if self.stand_in else ""
         return f"held out: the log likelihood rises by {self.gain:.1f}{other}"
+
+
+def rms_unseen(prepared: Prepared) -> float | None:
+    """Rms of the part held out minus the unchanged model, of which a choice is not asked; nothing without one."""
+    if not prepared.unseen.seen.any():
+        return None
+    cells = together(prepared)
+    whole = in_all_cells(unseen_too(prepared, prepared.point, cells), cells)
+    return CellPart(_fitted(prepared, prepared.point, whole), prepared.unseen.noise_rms).rms
 
 
 def judge_unseen(prepared: Prepared, found: Hypothesis) -> Unseen | None:
