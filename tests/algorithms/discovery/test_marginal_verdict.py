@@ -117,6 +117,8 @@ def test_a_stand_in_loses_against_the_cause(rng: np.random.Generator) -> None:
     unseen = judge_unseen(prepared, fitted(prepared, "bandwidth", fwhm=2.3))
     assert unseen is not None
     assert unseen.gain > unseen.stand_in_gain > 0.0
+    # Two of eight wavelengths are predicted, in three quarters of the sensor.
+    assert 0.3 * unseen.gain < unseen.waves_gain < 1.5 * unseen.gain
     assert unseen.why_not(PRIOR) == ""
     assert unseen.after_rms < unseen.before_rms
 
@@ -127,6 +129,8 @@ def test_an_effect_wins_at_equal_likelihood() -> None:
     equal = Unseen(10.0, 1.0, 1.0, "a pattern", 10.0 + 0.99 * odds)
     assert equal.why_not(PRIOR) == ""
     assert "with as many parameters" in replace(equal, stand_in_gain=10.0 + 1.01 * odds).why_not(PRIOR)
+    assert "wavelengths that are left out" in replace(equal, waves_gain=-10.1).why_not(PRIOR)
+    assert replace(equal, waves_gain=-9.9).why_not(PRIOR) == ""
     assert Unseen(-0.1, 1.0, 1.0).why_not(PRIOR) == "data held out are not predicted better"
 
 

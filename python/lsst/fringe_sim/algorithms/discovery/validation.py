@@ -17,6 +17,7 @@ from .islands import ANOTHER_ORDER, thickness_on_islands
 from .verdict import CONFIDENCE
 
 __all__ = [
+    "FEWEST_WAVELENGTHS",
     "HeldOut",
     "continued_thickness",
     "degrees_of_freedom",
