@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery.cells import CellData
+from lsst.fringe_sim.algorithms.discovery.continuation import continued
 from lsst.fringe_sim.algorithms.discovery.learned_columns import LocalColumns
 from lsst.fringe_sim.algorithms.discovery.learning import best_evidence, learn
-from lsst.fringe_sim.algorithms.discovery.marginal.lesson import CellLesson, CellPart, with_corrections
+from lsst.fringe_sim.algorithms.discovery.marginal.lesson import (
+    CellLesson,
+    CellPart,
+    together,
+    unseen_too,
+    with_corrections,
+)
 from lsst.fringe_sim.algorithms.discovery.marginal.next_flats import FlatForecast
 from lsst.fringe_sim.algorithms.discovery.marginal.preparation import prepare
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
@@ -156,3 +163,22 @@ def test_light_that_wanders_is_learned_and_noise_is_not() -> None:
         assert again is not None
         assert again.own == found.own
         assert again.heldout_gain != pytest.approx(found.heldout_gain, rel=0.01)
+
+
+# Cells held out ------------------------------------------------------------------------------------------
+
+
+def test_fringes_of_a_few_cells_keep_their_order_where_cells_were_held_out() -> None:
+    """A third of an order from cell to cell, and blocks of six cells."""
+    case = draw_case("none", np.random.default_rng(12), size=(48, 48))
+    prepared = prepare(
+        case.cube, FringeModel.from_setup(case.setup), [], 20_000, Rules(), np.random.default_rng(5)
+    )
+    point = unseen_too(prepared, prepared.point, together(prepared))
+    order = prepared.problem.forward.order_um
+    held = prepared.unseen.seen
+    away = np.abs(point.thickness_um.reshape(held.shape) - case.thickness_um) / order
+    assert away[held].max() < 0.1
+    # Continued over whole blocks, it is in another order in some.
+    across = continued(prepared.point.thickness_um.reshape(held.shape), prepared.cells.seen)
+    assert (np.abs(across - case.thickness_um)[held] / order).max() > 0.5

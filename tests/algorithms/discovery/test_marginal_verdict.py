@@ -61,8 +61,8 @@ def fitted(prepared: Prepared, name: str, **values: float) -> Hypothesis:
     return fit((name,), items, point.moved(point.levels, point.thickness_um, settings))
 
 
-def verdict_of(cube: FringeCube, *names: str) -> Verdict:
-    options = SearchOptions(core="marginal")
+def verdict_of(cube: FringeCube, *names: str, **limits: float) -> Verdict:
+    options = SearchOptions(core="marginal", **limits)
     return discover(cube, "ts8_e2v", catalogue(*names), rng=np.random.default_rng(5), options=options)
 
 
@@ -117,6 +117,8 @@ def test_a_stand_in_loses_against_the_cause(rng: np.random.Generator) -> None:
     unseen = judge_unseen(prepared, fitted(prepared, "bandwidth", fwhm=2.3))
     assert unseen is not None
     assert unseen.gain > unseen.stand_in_gain > 0.0
+    # Two of eight wavelengths are predicted, in three quarters of the sensor.
+    assert 0.3 * unseen.gain < unseen.waves_gain < 1.5 * unseen.gain
     assert unseen.why_not(PRIOR) == ""
     assert unseen.after_rms < unseen.before_rms
 
@@ -127,6 +129,8 @@ def test_an_effect_wins_at_equal_likelihood() -> None:
     equal = Unseen(10.0, 1.0, 1.0, "a pattern", 10.0 + 0.99 * odds)
     assert equal.why_not(PRIOR) == ""
     assert "with as many parameters" in replace(equal, stand_in_gain=10.0 + 1.01 * odds).why_not(PRIOR)
+    assert "wavelengths that are left out" in replace(equal, waves_gain=-10.1).why_not(PRIOR)
+    assert replace(equal, waves_gain=-9.9).why_not(PRIOR) == ""
     assert Unseen(-0.1, 1.0, 1.0).why_not(PRIOR) == "data held out are not predicted better"
 
 
@@ -151,6 +155,12 @@ def test_errors_of_the_tables_are_within_the_accuracy_of_the_model(rng: np.rando
     assert told["log_evidence_within"] < rules.sure
     assert told["log_evidence"] == loss.log_evidence - null.log_evidence
     assert evidence_within(null, 1e-9) == pytest.approx(0.0, abs=1e-3)
+    verdict = verdict_of(cube, "vignetting")
+    assert verdict.verdict == "no_discrepancy"
+    assert verdict.within_accuracy
+    assert verdict.learned == {}
+    assert "no more than the tables" in verdict.unexplained["reason"]
+    assert verdict_of(cube, "vignetting", model_accuracy=0.0).verdict == "unexplained"
 
 
 @pytest.mark.rng("a pattern of all exposures has a size")
@@ -165,6 +175,13 @@ def test_what_all_exposures_share_has_its_size(rng: np.random.Generator) -> None
     data = replace(null.problem.data, value=value.reshape(len(value), -1))
     changed = replace(prepared, null=fit((), (), null.problem_with(data)))
     assert size_of(changed)["of_counts"] == pytest.approx(0.02, rel=0.1)
+
+
+@pytest.mark.rng("another significance")
+def test_the_significance_is_that_which_was_asked_for(rng: np.random.Generator) -> None:
+    verdict = verdict_of(cube_of(rng, flats_of({})), "vignetting", significance=1.0 - 1e-9)
+    assert verdict.verdict == "unexplained"
+    assert verdict.global_probability > 1e-3
 
 
 # What is left to others --------------------------------------------------------------------------------------

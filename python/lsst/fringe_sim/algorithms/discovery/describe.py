@@ -28,14 +28,22 @@ MOST_PLACES = 5  # Places that are listed, the worst first
 
 
 def disagreement(
-    state: State, channels: tuple[Channel, ...], geometry: ImageGeometry, index: FloatArray, cell_px: int
+    state: State,
+    channels: tuple[Channel, ...],
+    geometry: ImageGeometry,
+    index: FloatArray,
+    cell_px: int,
+    filled: float = 1.0,
 ) -> Where:
-    """Where a fit and the data disagree."""
+    """Where a fit and the data disagree.
+
+    ``filled``: part of the cells that the fit has data of; the others are 0 in its residual.
+    """
     phase = fringe_phase(state.thickness_um, geometry.wavelength_nm, index)
     return Where(
         tuple(_by_wavelength(state, phase, geometry)),
         tuple(_by_amplifier(state, geometry)),
-        _strongest_scale(state, cell_px),
+        _strongest_scale(state, cell_px, filled),
         tuple(_by_phase(state, phase)),
         tuple(
             {
@@ -50,9 +58,17 @@ def disagreement(
 
 
 def describe_residual(
-    state: State, geometry: ImageGeometry, index: FloatArray, cell_px: int, channels: tuple[Channel, ...]
+    state: State,
+    geometry: ImageGeometry,
+    index: FloatArray,
+    cell_px: int,
+    channels: tuple[Channel, ...],
+    filled: float = 1.0,
 ) -> dict[str, Any]:
-    """What a leftover looks like, without a name: waveform, colour, scales, pattern of amplifiers, modes."""
+    """What a leftover looks like, without a name: waveform, colour, scales, pattern of amplifiers, modes.
+
+    ``filled``: see `disagreement`.
+    """
     phase = fringe_phase(state.thickness_um, geometry.wavelength_nm, index)
     colour = []
     for plane, wavelength in enumerate(geometry.wavelength_nm):
@@ -64,13 +80,13 @@ def describe_residual(
         cosine, sine, sigma = _harmonic(state, phase, harmonic)
         harmonics.append({"harmonic": harmonic, "cos": cosine, "sin": sine, "sigma": sigma})
     planes = state.residual.reshape(len(state.residual), -1)
-    modes = np.linalg.svd(planes @ planes.T / planes.shape[1], compute_uv=False)
+    modes = np.linalg.svd(planes @ planes.T / (filled * planes.shape[1]), compute_uv=False)
     return {
         "channels": [c.name for c in sorted(channels, key=lambda c: c.probability) if c.probability < 1e-3],
         "wavelength": colour,
         "thickness_phase_waveform": _by_phase(state, phase),
         "harmonics": harmonics,
-        "spatial_power": _radial_power(state, cell_px),
+        "spatial_power": _radial_power(state, cell_px, filled),
         "amplifiers": _by_amplifier(state, geometry),
         "principal_modes": [float(x) for x in modes[:5]],
         "places": places_apart(state.residual, geometry),
@@ -198,7 +214,7 @@ def _harmonic(state: State, phase: FloatArray, harmonic: int) -> tuple[float, fl
     return cosine, sine, float(np.sqrt(2.0 / total))
 
 
-def _radial_power(state: State, cell_px: int) -> list[dict[str, float]]:
+def _radial_power(state: State, cell_px: int, filled: float) -> list[dict[str, float]]:
     if min(state.thickness_um.shape) < FEWEST_ROWS:
         return []
     power = np.mean([dctn(plane, norm="ortho") ** 2 for plane in state.residual], axis=0)
@@ -208,9 +224,9 @@ def _radial_power(state: State, cell_px: int) -> list[dict[str, float]]:
     rows = []
     for low, high in itertools.pairwise(edges):
         inside = (frequency >= low) & (frequency < high)
-        count = int(inside.sum()) * len(state.residual)
+        count = filled * int(inside.sum()) * len(state.residual)
         if count:
-            mean = float(power[inside].mean())
+            mean = float(power[inside].mean()) / filled
             rows.append(
                 {"scale_px": cell_px / float(np.sqrt(low * high)), "power": mean,
                  "probability": float(chdtrc(count, mean * count))}
@@ -218,6 +234,6 @@ def _radial_power(state: State, cell_px: int) -> list[dict[str, float]]:
     return rows
 
 
-def _strongest_scale(state: State, cell_px: int) -> float:
-    rows = [row for row in _radial_power(state, cell_px) if row["probability"] < 1e-3]
+def _strongest_scale(state: State, cell_px: int, filled: float) -> float:
+    rows = [row for row in _radial_power(state, cell_px, filled) if row["probability"] < 1e-3]
     return max(rows, key=lambda row: row["power"])["scale_px"] if rows else 0.0

@@ -40,7 +40,7 @@ class Problem:
     forward: Forward
     thickness_um: FloatArray  # (N,): the first thickness, about which that of a cell is Gaussian
     response_sigma: float  # prior of the response of a cell
-    thickness_sigma_um: float = 1.0  # some fringe orders, which pulls no cell
+    thickness_sigma_um: float | FloatArray = 1.0  # of all or of each; some fringe orders, which pulls no cell
 
     def at(self, settings: Mapping[str, float], levels: FloatArray, thickness_um: FloatArray) -> Point:
         """The likelihood linearised about effects, levels ``(W,)`` and thickness ``(N,)``."""
@@ -157,8 +157,8 @@ class Point:
     def log_det(self) -> float:
         """Half of the log determinant of the cells over that of their priors."""
         first, _, second = self._root
-        priors = len(first) * np.log(self.problem.response_sigma * self.problem.thickness_sigma_um)
-        return float(np.log(first).sum() + np.log(second).sum() + priors)
+        priors = self.problem.response_sigma * self.problem.thickness_sigma_um
+        return float(np.log(first).sum() + np.log(second * priors).sum())
 
     @cached_property
     def _mean_log_det(self) -> float:

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....errors import OutOfRangeError
-from ...inference import Hypothesis, Point, relaxed
+from ...inference import Data, Hypothesis, Point, fit, relaxed
 from ..learning import SIZES, Prior
+from ..validation import FEWEST_WAVELENGTHS
 from ..verdict_words import LEARNED_WORDS
 from .lesson import (
     CellPart,
@@ -23,12 +24,15 @@ from .lesson import (
 )
 from .preparation import Prepared
 
-__all__ = ["StandIn", "Unseen", "judge_unseen", "stand_in"]
+__all__ = ["StandIn", "Unseen", "judge_unseen", "rms_unseen", "stand_in"]
 
 FloatArray = NDArray[np.float64]
 
 ROUNDS = 3
 """How often a stand-in is fitted again about itself, as long as that helps: what it does is hardly linear."""
+
+FAINT = 1e-9
+"""Weight of wavelengths that are left out: a level is all that follows them."""
 
 STRIDES = (1.0, 0.3, 0.1)
 """Parts of the way to a fit that are tried."""
@@ -43,6 +47,8 @@ class Unseen:
     after_rms: float
     stand_in: str = ""  # what it is; empty where none explains anything
     stand_in_gain: float = 0.0
+    # the same as ``gain`` of wavelengths that were left out of a fit, whose cells have its thickness; 0 without any
+    waves_gain: float = 0.0
 
     def why_not(self, outsider_prior: float) -> str:
         """Why effects are not believed, or nothing.
@@ -54,6 +60,8 @@ class Unseen:
         """
         if self.gain <= 0.0:
             return "data held out are not predicted better"
+        if self.gain + self.waves_gain <= 0.0:
+            return "wavelengths that are left out are predicted worse than by the unchanged model"
         ahead = self.stand_in_gain - self.gain
         if self.stand_in and ahead > math.log((1.0 - outsider_prior) / outsider_prior):
             return (
@@ -66,7 +74,19 @@ class Unseen:
     def text(self) -> str:
         """One line for the notes."""
         other = f", with {self.stand_in} of equal size by {self.stand_in_gain:.1f}" if self.stand_in else ""
-        return f"held out: the log likelihood rises by {self.gain:.1f}{other}"
+        return (
+            f"held out: the log likelihood of blocks rises by {self.gain:.1f}{other}; that of every fourth "
+            f"wavelength, left out of the fit, by {self.waves_gain:.1f}"
+        )
+
+
+def rms_unseen(prepared: Prepared) -> float | None:
+    """Rms of the part held out minus the unchanged model, of which a choice is not asked; nothing without one."""
+    if not prepared.unseen.seen.any():
+        return None
+    cells = together(prepared)
+    whole = in_all_cells(unseen_too(prepared, prepared.point, cells), cells)
+    return CellPart(_fitted(prepared, prepared.point, whole), prepared.unseen.noise_rms).rms
 
 
 def judge_unseen(prepared: Prepared, found: Hypothesis) -> Unseen | None:
@@ -77,7 +97,12 @@ def judge_unseen(prepared: Prepared, found: Hypothesis) -> Unseen | None:
     # All are judged with cells as the best thickness shapes them.
     whole = in_all_cells(unseen_too(prepared, found.point, cells), cells)
     before, after = (CellPart(_fitted(prepared, one.point, whole), noise) for one in (prepared.null, found))
-    told = Unseen(before.point.cost - after.point.cost, before.rms, after.rms)
+    told = Unseen(
+        before.point.cost - after.point.cost,
+        before.rms,
+        after.rms,
+        waves_gain=_gain_of_waves(prepared, found),
+    )
     rival = stand_in(CellPart(with_corrections(prepared.point), noise), len(found.items))
     if rival is None:
         return told
@@ -94,6 +119,36 @@ def _fitted(prepared: Prepared, found: Point, whole: Point) -> Point:
     forward = replace(found.problem.forward, shape=whole.problem.forward.shape)
     problem = replace(found.problem, data=data_of(prepared.unseen), forward=forward, thickness_um=start)
     return in_own_cells(problem.at(found.settings, found.levels, start))
+
+
+def _gain_of_waves(prepared: Prepared, found: Hypothesis) -> float:
+    """Log likelihood of every fourth wavelength over the unchanged model, after fits that have not seen it.
+
+    0 where there are few wavelengths, or others say nothing of those left out.
+    """
+    waves = len(found.point.levels)
+    forward = found.point.problem.forward
+    alone = any(forward.effect_of(i.key).parameter(i.parameter).wavelength_nm > 0.0 for i in found.items)
+    if waves < FEWEST_WAVELENGTHS or alone:
+        return 0.0
+    out = (np.arange(waves) % 4 == 2)[:, np.newaxis]
+    before, after = (_cost_of_waves(one, out) for one in (prepared.null, found))
+    return before - after
+
+
+def _cost_of_waves(found: Hypothesis, out: NDArray[np.bool_]) -> float:
+    """Minus the log likelihood of some wavelengths ``(W, 1)``, predicted by a fit to the others."""
+    problem, data = found.point.problem, found.point.problem.data
+    seen = replace(problem, data=Data(data.value, np.where(out, FAINT, 1.0) * data.weight))
+    start = seen.at(found.point.settings, found.point.levels, found.point.thickness_um)
+    point = fit(found.effects, found.items, start).point
+    rest = replace(
+        problem,
+        data=Data(data.value, np.where(out, 1.0, FAINT) * data.weight),
+        thickness_um=point.thickness_um,
+        thickness_sigma_um=point.thickness_sigma_um,
+    )
+    return relaxed(rest.at(point.settings, point.levels, point.thickness_um)).cost
 
 
 # Stand-in -----------------------------------------------------------------------------------------------------------

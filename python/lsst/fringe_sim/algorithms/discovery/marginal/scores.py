@@ -34,6 +34,7 @@ class Scored:
     step: FloatArray  # linear step of its parameters from null
     signature: FloatArray  # (W * N,): what that step does beside all that is free, of unit length
     start: Point | None = None  # what the effect itself proposes
+    fall: float = 0.0  # of χ² by that step; 0 where it would rise
 
 
 class Scorer:
@@ -86,7 +87,9 @@ class Scorer:
             best, step = -1.0, -step
         signature = np.tensordot(step, own.value - np.tensordot(across.T, self.columns.value, axes=1), axes=1)
         flat = self.point.projected(signature).ravel()
-        return Scored(name, best, degrees, step, flat / max(float(np.linalg.norm(flat)), 1e-300))
+        fall = max(2.0 * float(gradient @ step) - float(step @ matrix @ step), 0.0)
+        unit = flat / max(float(np.linalg.norm(flat)), 1e-300)
+        return Scored(name, best, degrees, step, unit, fall=fall)
 
 
 def best_gain(matrix: FloatArray, gradient: FloatArray, scale: FloatArray) -> tuple[float, FloatArray]:
@@ -127,7 +130,8 @@ def proposed(effect: Effect, items: tuple[Coordinate, ...], base: Hypothesis) ->
     step = np.array([best.settings[item.key] - item.null for item in items])
     change = point.projected(best.whitened(best.value) - point.whitened(point.value)).ravel()
     unit = change / max(float(np.linalg.norm(change)), 1e-300)
-    return Scored(effect.name, point.cost - best.cost, len(items), step, unit, best)
+    gain = point.cost - best.cost
+    return Scored(effect.name, gain, len(items), step, unit, best, max(2.0 * gain, 0.0))
 
 
 def _begun(effect: Effect, items: tuple[Coordinate, ...], values: dict[str, float], point: Point) -> Point:

@@ -27,7 +27,7 @@ from ..verdict import Gap, NamedEffect, Verdict
 from ..verdict_words import METRIC, WITHIN_ACCURACY, chance_text, said_of_left_out
 from .accuracy import told_accuracy
 from .critics import is_out_of_reach, judge, state_of, total_chance
-from .heldout import Unseen, judge_unseen
+from .heldout import Unseen, judge_unseen, rms_unseen
 from .lesson import CellLesson, CellPart, with_corrections
 from .naming import Naming, name_effects
 from .next_flats import FlatForecast
@@ -295,11 +295,24 @@ class MarginalSearch:
                  "parameters": {k: [p.value, p.sigma] for k, p in e.parameters.items()}}
                 for e in partial
             ],
-            **describe_residual(state, cells.geometry, self.index, cells.cell_px, self._channels(found)),
+            **describe_residual(
+                state, cells.geometry, self.index, cells.cell_px, self._channels(found), float(cells.seen.mean())
+            ),
         }  # fmt: skip
         told = self._told("no_discrepancy" if within else "unexplained", found, (), description, unseen)
         learned = {} if within else self._learned(alike)
         return replace(told, learned=learned, accuracy={**accuracy, "within": within})
+
+    def _rms_outside(self, inside: tuple[float, float], unseen: Unseen | None) -> tuple[float, float]:
+        """Rms of the part held out before and after; that inside where there is none, or no time."""
+        if unseen is not None:
+            return unseen.before_rms, unseen.after_rms
+        try:
+            with time_limit(self.until):
+                unchanged = rms_unseen(self.prepared)
+        except OutOfTimeError:
+            return inside
+        return inside if unchanged is None else (unchanged, unchanged)
 
     def _told(
         self,
@@ -313,16 +326,16 @@ class MarginalSearch:
         null, before = prepared.null, self._channels(prepared.null)
         state = state_of(null.point, null.point.level_columns)
         first, last = rms_left(prepared, null), rms_left(prepared, found)
-        outside = (first, last) if unseen is None else (unseen.before_rms, unseen.after_rms)
+        outside = self._rms_outside((first, last), unseen)
         scores = [
-            {"name": one.name, "score": 2.0 * one.gain, "degrees": one.degrees}
-            for one in self.sets.scores(null)
+            {"name": one.name, "score": one.fall, "degrees": one.degrees}
+            for one in sorted(self.sets.scores(null), key=lambda one: -one.fall)
         ]
         rounds = [self.sets.best_of(size)[0] for size in range(1, len(found.effects))]
         steps = steps_of(prepared, [*rounds, found] if found.effects else [], self._leaves_noise)
         return Verdict(
             word, effects,
-            disagreement(state, before, cells.geometry, self.index, cells.cell_px),
+            disagreement(state, before, cells.geometry, self.index, cells.cell_px, float(cells.seen.mean())),
             Gap(METRIC, first, last, *outside, cells.noise_rms),
             steps, unexplained or {}, self.model.setup.name, total_chance(before),
             tuple(scores),
