@@ -5,16 +5,19 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from ...array_types import BoolArray, FloatArray
+__all__ = ["continued"]
+
+FloatArray = NDArray[np.float64]
 
 STIFFNESS, NO_WEIGHT = 1e-3, 1e-12
 """Weights of the curvature and of cells that are not known; those of the others are 1."""
 
 
-def continued(field: FloatArray, known: BoolArray) -> FloatArray:
+def continued(field: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
     """Continue a field from where it is known with the least sum of squares of its second derivatives.
 
     ``field`` (ny, nx): the field; its values elsewhere do not matter. ``known`` (ny, nx). Returns (ny, nx).

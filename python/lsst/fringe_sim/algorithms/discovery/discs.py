@@ -7,14 +7,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
-from ...array_types import BoolArray, ComplexArray, FloatArray
+__all__ = ["Disc", "Discs"]
+
+FloatArray = NDArray[np.float64]
 
 SMALLEST_RADIUS, LARGEST_PART, RADIUS_RATIO = 2.0, 0.35, 1.2
 """Radii that are tried: the smallest [cells], the largest over the shorter side, and one over the one before."""
 
-LEAST_SEEN = 0.3  # Part of a disc that must lie on cells with data
+LEAST_SEEN = 0.3
+"""Part of a disc that must lie on cells with data."""
 
 Disc = tuple[float, float, float, float]
 """Fall of χ² that a disc promises, its row, column and radius [cells]."""
@@ -27,11 +31,11 @@ class Discs:
     shape: tuple[int, int]  # rows and columns of cells
     padded: tuple[int, int]  # the same with room for the largest disc
     radii: list[float]  # radii [cells]
-    transforms: list[ComplexArray]  # Fourier transform of a disc of each radius
-    usable: list[BoolArray]  # cells about which enough of a disc of each radius has data
+    transforms: list[NDArray[np.complex128]]  # Fourier transform of a disc of each radius
+    usable: list[NDArray[np.bool_]]  # cells about which enough of a disc of each radius has data
 
     @classmethod
-    def of(cls, seen: BoolArray) -> Discs:
+    def of(cls, seen: NDArray[np.bool_]) -> Discs:
         """Discs about the cells with and without data."""
         shape = (seen.shape[0], seen.shape[1])
         largest = LARGEST_PART * min(shape)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.optimize import minimize
 
-from ...array_types import BoolArray, FloatArray
 from ..parabola import parabolic_minimum
 from .cells import CellData
 from .channels import State, beside_thickness
@@ -20,6 +19,19 @@ from .continuation import continued
 from .discs import Disc, Discs
 from .fit import Coordinate, Fit, Problem
 from .thickness_steps import best_thickness_step
+
+__all__ = [
+    "ANOTHER_ORDER",
+    "IslandStart",
+    "followed_on_island",
+    "island_starts",
+    "mended_on_islands",
+    "placed_on_island",
+    "start_at_step",
+    "thickness_on_islands",
+]
+
+FloatArray = NDArray[np.float64]
 
 SIZES_TRIED = (0.01, 0.02, 0.04)
 SIZES_PER_REPETITION = 12
@@ -40,7 +52,8 @@ COMPARED_THICKNESSES = 120
 ISLAND_CELLS = 400
 """Shifts of the thickness in a fringe order, and the thicknesses or cells on which they are compared."""
 
-ANOTHER_ORDER = 0.5  # Fringe orders from which on a thickness is another one, to which no fit gets by itself
+ANOTHER_ORDER = 0.5
+"""Fringe orders from which on a thickness is another one, to which no fit gets by itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +194,7 @@ def placed_on_island(
 
 
 def thickness_on_islands(
-    problem: Problem, fit: Fit, thickness_um: FloatArray, held_out: BoolArray
+    problem: Problem, fit: Fit, thickness_um: FloatArray, held_out: NDArray[np.bool_]
 ) -> FloatArray:
     """Thickness of cells on islands that took no part in a fit, from those within half an order [µm].
 

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ...array_types import FloatArray
 from ...effects import AMPLIFIERS, LEARNED, ImageGeometry
 from ...effects.learned import (
     LEARNED_HARMONICS,
@@ -23,10 +22,15 @@ from ...effects.learned import (
 from .channels import State
 from .fit import Columns, Fit, PlaneColumns, Problem
 
+__all__ = ["Family", "LocalColumns", "families", "over_wavelength", "with_learned"]
+
+FloatArray = NDArray[np.float64]
+
 LENGTHS_NM = (1.0, 30.0, 100.0)
 """Correlation lengths over wavelength that are tried [nm]: none at all, some exposures, all of them."""
 
-DECAYS = (1.0, 0.3)  # Factors from one harmonic of the fringe to the next
+DECAYS = (1.0, 0.3)
+"""Factors from one harmonic of the fringe to the next."""
 
 ORDERS = (1.5, 3.0, 6.0, 12.0)
 """Widths of the spectra of smooth patterns over the sensor [half waves along a side]."""

@@ -17,21 +17,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...array_types import BoolArray, FloatArray
 from .channels import State
 from .fit import Design, Fit, Problem, Projected, fit_model, linearise_at
 from .learned_columns import Family, families, with_learned
 from .validation import FEWEST_ROWS, misfit_rms, thickness_starts
 
-FALSE_ALARMS = 0.01  # Chance with which noise alone may seem to teach something
+__all__ = ["FALSE_ALARMS", "Learned", "Prior", "evidence_of_correction", "judging_cells", "learn"]
+
+FloatArray = NDArray[np.float64]
+
+FALSE_ALARMS = 0.01
+"""Chance with which noise alone may seem to teach something."""
 
 DRAWS = 199
 """Draws of noise. The rank of the data among them is an exact chance for any number (Phipson & Smyth 2010, doi
 10.2202/1544-6115.1585); with this many, one draw that is as good is still an alarm of one in a hundred."""
 
-ROUNDS = 1  # Rounds in which a correction is learned again about itself
-AT_ONCE = 20  # Draws that are in memory together
-TILE = 2  # Side of the tiles of cells of which every other is judged by
+ROUNDS = 1
+"""Rounds in which a correction is learned again about itself."""
+
+AT_ONCE = 20
+"""Draws that are in memory together."""
+
+TILE = 2
+"""Side of the tiles of cells of which every other is judged by."""
 
 SIZES = np.geomspace(1e-5, 0.1, 17)
 """Rms of a parameter that are tried: from what averages over all cells hide to what is as large as fringes."""
@@ -176,7 +185,7 @@ def _taught(
     )  # fmt: skip
 
 
-def judging_cells(shape: tuple[int, ...]) -> BoolArray:
+def judging_cells(shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Cells that are judged by: every other tile along both sides, ``(ny, nx)``; the others lie all around them.
 
     A pattern over the sensor can be told where it is seen near by, not in the middle of a block without data.
@@ -191,7 +200,7 @@ def learn(
     problem: Problem,
     null: Fit,
     best: Fit,
-    held_out: BoolArray,
+    held_out: NDArray[np.bool_],
     rng: np.random.Generator,
     least: float,
 ) -> Learned | None:
@@ -266,7 +275,7 @@ def _again(inside: Problem, fitted: Fit, family: Family, taught: _Taught) -> tup
     return fitted, dict(zip(family.keys, known.tolist(), strict=True))
 
 
-def _chi2_of(problem: Problem, fit: Fit, cells: BoolArray) -> float:
+def _chi2_of(problem: Problem, fit: Fit, cells: NDArray[np.bool_]) -> float:
     """χ² of some of the cells ``(ny, nx)``."""
     expected = problem.expected_of(fit)
     residual = problem.whitener(expected)(problem.cells.value - expected)
@@ -278,7 +287,7 @@ def _beyond(
     outside: Problem,
     null: Fit,
     fitted: Fit,
-    judged: BoolArray,
+    judged: NDArray[np.bool_],
     settings: dict[str, float],
 ) -> Fit:
     """Thickness and levels fitted to the cells held out, effects and correction as they were learned."""

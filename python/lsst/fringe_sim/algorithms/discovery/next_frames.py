@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ...array_types import FloatArray
 from ...model import FringeModel, Setup, setup_names
 from ..measurement_forecast import RESPONSE_SCATTER
 from ..next_measurement import FlatMeasurement, FlatSeries, Measurement, PairForecast, RankedMeasurement
@@ -30,6 +30,10 @@ from .fit import (
 )
 from .forward import Exposures, Forward
 from .next_step import Values
+
+__all__ = ["FrameForecast", "laboratory_of"]
+
+FloatArray = NDArray[np.float64]
 
 
 class FrameForecast:

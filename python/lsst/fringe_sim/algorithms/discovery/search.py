@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from ...array_types import BoolArray, FloatArray
 from ...effects import Effect, known_effects
 from ...model import FringeModel, Setup
 from ...products.fringe_cube import FringeCube
@@ -54,6 +54,10 @@ from .validation import (
 )
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where, probability_text
 from .verdict_words import chance_text
+
+__all__ = ["SearchOptions", "discover"]
+
+FloatArray = NDArray[np.float64]
 
 _METRIC = "rms of data minus model, relative counts"
 
@@ -199,7 +203,7 @@ class _Reached:
     """How far a search has come."""
 
     prepared: Prepared
-    heldout: BoolArray
+    heldout: NDArray[np.bool_]
     whole: Selector
     chance: float
     sets: SetSearch | None = None

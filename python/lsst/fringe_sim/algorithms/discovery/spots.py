@@ -7,21 +7,27 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
-from ...array_types import FloatArray
 from .channels import Channel, State, beside_thickness
+
+__all__ = ["log_evidence_of_spots", "spot_channel"]
+
+FloatArray = NDArray[np.float64]
 
 RADII = (3.0, 4.5, 7.0, 10.0, 15.0)
 """Standard deviations of the spots that are looked for [cells]; larger ones are patterns of large scale."""
 
-LEAST_SEEN = 0.25  # Part of a spot that must lie on cells with data
+LEAST_SEEN = 0.25
+"""Part of a spot that must lie on cells with data."""
 
 MOST_SPOTS = 6
 
-WORTH_FITTING = 12.0  # Fall of χ² that a further spot must promise
+WORTH_FITTING = 12.0
+"""Fall of χ² that a further spot must promise."""
 
 DEPTHS = math.log(1e3)
 """Range of the logarithm of the depth that a spot may have: equal chances from 0.01 to 10 per cent."""

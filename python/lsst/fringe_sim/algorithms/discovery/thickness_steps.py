@@ -9,10 +9,13 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse import csr_array
 
-from ...array_types import FloatArray
 from .channels import State
 from .discs import Disc, Discs
 from .fit import Design
+
+__all__ = ["best_thickness_step"]
+
+FloatArray = NDArray[np.float64]
 
 SMALLEST_RADIUS, MIDDLES_PER_RADIUS = 2.8, 2.0
 """Radius of the smallest disc of which no smooth thickness takes up all [cells]; how closely the middles lie for
@@ -20,7 +23,8 @@ which it is computed what one does take up."""
 
 DISCS_AT_ONCE = 400
 
-LEAST_LEFT = 0.02  # Part of what a disc does that a smooth thickness must leave
+LEAST_LEFT = 0.02
+"""Part of what a disc does that a smooth thickness must leave."""
 
 
 def best_thickness_step(state: State) -> tuple[Disc, float]:

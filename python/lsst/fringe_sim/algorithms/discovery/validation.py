@@ -6,14 +6,28 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.special import chdtri
 
-from ...array_types import BoolArray, FloatArray
 from .continuation import continued
 from .fit import Fit, Problem, fit_model
 from .islands import ANOTHER_ORDER, thickness_on_islands
 from .verdict import CONFIDENCE
+
+__all__ = [
+    "HeldOut",
+    "continued_thickness",
+    "degrees_of_freedom",
+    "held_out_blocks",
+    "misfit_rms",
+    "thickness_starts",
+    "validate",
+    "whole_thickness",
+]
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 BLOCKS_ACROSS = 8
 FEWEST_ROWS = 12
@@ -22,8 +36,11 @@ FEWEST_ROWS = 12
 MUCH_WORSE = 4.0
 """χ² of the cells held out over that of the others, from which on their thickness may be another."""
 
-NEAR_ISLAND = 8  # Cells about an island into which a smooth thickness may be bent
-FEWEST_WAVELENGTHS = 8  # Wavelengths from which on every fourth is left out at once
+NEAR_ISLAND = 8
+"""Cells about an island into which a smooth thickness may be bent."""
+
+FEWEST_WAVELENGTHS = 8
+"""Wavelengths from which on every fourth is left out at once."""
 
 
 @dataclass(frozen=True)

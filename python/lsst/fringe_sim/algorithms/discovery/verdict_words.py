@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .verdict import Verdict
 
-LEAST_CHANCE = 1e-300  # Chances below this are not told: they are at the end of what a number can be
+__all__ = ["accuracy_text", "chance_text", "learned_text"]
+
+LEAST_CHANCE = 1e-300
+"""Chances below this are not told: they are at the end of what a number can be."""
 
 LEARNED_WORDS = {
     "learned_response": "a wave form over the fringe phase",
