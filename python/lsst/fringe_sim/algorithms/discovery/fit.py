@@ -753,7 +753,7 @@ class _Solver:
         change = change + np.tensordot(step[levels:], design.effects.values, axes=1)
         along = (design.slope * change).sum(axis=0)
         used = square > 0.01 * square.max()
-        return float(np.percentile(np.abs(along[used] / square[used]), 98.0)) if used.any() else 0.0
+        return float(np.percentile(np.abs(along[used] / square[used]), 98.0))
 
     def _improve(self, point: _Point, design: Design, damping: float) -> tuple[_Point | None, float]:
         levels = self.problem.n_levels
