@@ -27,6 +27,7 @@ from lsst.fringe_sim.cli import (
     sky,
     sky_frames,
 )
+from lsst.fringe_sim.cli.inputs import read_settings
 from lsst.fringe_sim.cli.lab_frames import LabSeries
 from lsst.fringe_sim.cli.parameters import LABORATORY, SKY
 from lsst.fringe_sim.errors import FringeSimError, InputError
@@ -341,3 +342,10 @@ def test_a_key_that_is_stated_twice_is_named() -> None:
     assert provenance._each_key_once([("a", 1), ("b", 2)]) == {"a": 1, "b": 2}
     with pytest.raises(InputError, match="key is 'b'; allowed: a key once"):
         provenance._each_key_once([("a", 1), ("b", 2), ("c", 2), ("b", 3)])
+
+
+@pytest.mark.parametrize(("text", "found"), [("", "empty"), ("[1]", "list"), ("word", "str")])
+def test_settings_that_are_no_mapping(text: str, found: str, tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(InputError, match=rf"a\.yaml: settings file is '{found}'"):
+        read_settings(tmp_path / "a.yaml")

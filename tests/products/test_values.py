@@ -424,3 +424,12 @@ def test_arrays_of_a_product_cannot_be_written(kind: str) -> None:
     assert len(found) >= 2
     assert not any(each.flags.writeable for each in found)
     assert ones.flags.writeable
+
+
+def test_what_stands_for_what_frames_of_the_sky_do_not_say() -> None:
+    """Half a minute at the airmass of the paper, without noise and without an error of the sum."""
+    made = SkyFrames.from_arrays(100.0 * np.ones((2, 3, 4)), 14.0 * np.ones((3, 4)), hour=22.0)
+    assert [frame.hour for frame in made.frames] == [22.0, 22.0]
+    for frame in made.frames:
+        assert (frame.exposure_s, frame.airmass, frame.seed, frame.quadrature_error) == (30.0, 1.2, None, 0.0)
+        assert not frame.mask.any()

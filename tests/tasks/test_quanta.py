@@ -9,14 +9,24 @@ from typing import Any
 
 import numpy as np
 import pytest
+from lsst.pipe import base
 
 from lsst.fringe_sim.errors import OutOfRangeError
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.instrument.night import NightHistory
 from lsst.fringe_sim.model import Setup
-from lsst.fringe_sim.tasks import SkyFringeSimConfig, SkyFringeSimTask, sky_fringe_sim
+from lsst.fringe_sim.tasks import (
+    EpoxyFitConfig,
+    EpoxyFitTask,
+    SkyFringeSimConfig,
+    SkyFringeSimTask,
+    epoxy_fit,
+    sky_fringe_sim,
+)
+from lsst.fringe_sim.tasks.epoxy_fit import EpoxyFitConnections
+from lsst.fringe_sim.tasks.fringe_bias import FringeBiasConfig, FringeBiasConnections
 from lsst.fringe_sim.tasks.isr_flat_prep import IsrFlatPrepConfig, IsrFlatPrepConnections
-from lsst.fringe_sim.tasks.quantum import config_digest
+from lsst.fringe_sim.tasks.quantum import config_digest, data_id_of, flats_input
 
 DETECTOR = Camera.from_name("lsstCam").detector("R22_S11")
 SETUP = Setup.from_name("lsst_e2v")
@@ -113,3 +123,82 @@ def test_both_ends_of_a_night_are_in_it(hour: float, row: int) -> None:
         sky_fringe_sim._at_hour(night, -1.1e-6)
     with pytest.raises(OutOfRangeError):
         sky_fringe_sim._at_hour(night, 10.0 + 1.1e-6)
+
+
+class Exposed(dict[str, int]):
+    """Data id of an exposure with its record."""
+
+    def __init__(self, number: int, kind: str, target: str | None = None) -> None:
+        super().__init__(exposure=number)
+        record = SimpleNamespace(id=number, observation_type=kind, target_name=target)
+        self.records = {"exposure": record}
+
+
+def refs(*data_ids: Exposed) -> list[Any]:
+    return [SimpleNamespace(dataId=data_id) for data_id in data_ids]
+
+
+@pytest.fixture
+def only_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the parent class of all connections checks needs real datasets."""
+    monkeypatch.setattr(base.PipelineTaskConnections, "adjustQuantum", lambda self, *given: ({}, {}))
+
+
+@pytest.mark.usefixtures("only_own")
+def test_a_bias_is_made_of_the_biases_in_their_order() -> None:
+    connections = FringeBiasConnections(config=FringeBiasConfig())
+    offered = refs(Exposed(3, "bias"), Exposed(1, "flat"), Exposed(2, "bias"))
+    inputs: dict[str, Any] = {"raws": ("connection", offered)}
+    changed, outputs = connections.adjustQuantum(inputs, {}, "bias", None)
+    assert changed == inputs == {"raws": ("connection", [offered[2], offered[0]])}
+    assert outputs == {}
+    for none in (offered[1:2], []):
+        with pytest.raises(base.NoWorkFound):
+            connections.adjustQuantum({"raws": (connections.raws, none)}, {}, "bias", None)
+
+
+@pytest.mark.usefixtures("only_own")
+def test_a_fit_has_its_flats_in_the_order_of_their_wavelengths() -> None:
+    """Those without one come first, and those of one wavelength by their number."""
+    connections = EpoxyFitConnections(config=EpoxyFitConfig())
+    targets = ["0990.000 nm", "0880.000 nm", None, "0880.000 nm"]
+    offered = refs(*(Exposed(9 - number, "flat", target) for number, target in enumerate(targets)))
+    inputs: dict[str, Any] = {"flats": ("connection", offered)}
+    changed, _ = connections.adjustQuantum(inputs, {}, "fit", None)
+    assert changed == inputs == {"flats": ("connection", [offered[number] for number in (2, 3, 1, 0)])}
+    with pytest.raises(base.NoWorkFound):
+        connections.adjustQuantum({"flats": (connections.flats, [])}, {}, "fit", None)
+
+
+@pytest.mark.parametrize("both", [True, False])
+def test_a_fit_stores_the_silicon_if_there_is_one(both: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Flats are read when the fit asks for them."""
+    read: list[Any] = []
+    monkeypatch.setattr(epoxy_fit, "sensor_of", lambda data_id: DETECTOR)
+
+    def run(self: Any, flats: Any, number: int, detector: Any) -> Any:
+        assert (number, read) == (2, [])
+        assert list(flats) == ["flat of a", "flat of b"]
+        return SimpleNamespace(thickness="thickness", silicon="silicon" if both else None)
+
+    monkeypatch.setattr(EpoxyFitTask, "run", run)
+
+    def get(ref: str) -> Any:
+        return SimpleNamespace(get=lambda: read.append(ref) or f"flat of {ref}")
+
+    put: list[Any] = []
+    context: Any = SimpleNamespace(
+        quantum=SimpleNamespace(dataId="id"), get=get, put=lambda *each: put.append(each)
+    )
+    outputs = SimpleNamespace(thickness="t", silicon="s")
+    EpoxyFitTask(config=EpoxyFitConfig()).runQuantum(context, SimpleNamespace(flats=["a", "b"]), outputs)
+    assert put == [("thickness", "t"), *([("silicon", "s")] if both else [])]
+    assert read == ["a", "b"]
+
+
+def test_flats_are_many_and_read_one_by_one() -> None:
+    made = flats_input()
+    assert (made.multiple, made.deferLoad) == (True, True)
+    assert data_id_of(SimpleNamespace(quantum=SimpleNamespace(dataId="id"))) == "id"
+    with pytest.raises(AssertionError, match="data id"):
+        data_id_of(SimpleNamespace(quantum=SimpleNamespace(dataId=None)))
