@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....errors import OutOfRangeError
-from ...inference import Data, Hypothesis, Point, fit, relaxed
+from ...inference import CellShape, Data, Hypothesis, Point, fit, relaxed
 from ..learning import SIZES, Prior
 from ..validation import FEWEST_WAVELENGTHS
 from ..verdict_words import LEARNED_WORDS
@@ -84,9 +84,9 @@ def rms_unseen(prepared: Prepared) -> float | None:
     """Rms of the part held out minus the unchanged model, of which a choice is not asked; nothing without one."""
     if not prepared.unseen.seen.any():
         return None
-    cells = together(prepared)
-    whole = in_all_cells(unseen_too(prepared, prepared.point, cells), cells)
-    return CellPart(_fitted(prepared, prepared.point, whole), prepared.unseen.noise_rms).rms
+    whole = _whole(prepared, prepared.point)
+    own = relaxed(whole.problem_with(data_of(prepared.unseen)))
+    return CellPart(own, prepared.unseen.noise_rms).rms
 
 
 def judge_unseen(prepared: Prepared, found: Hypothesis) -> Unseen | None:
@@ -94,31 +94,33 @@ def judge_unseen(prepared: Prepared, found: Hypothesis) -> Unseen | None:
     if not prepared.unseen.seen.any():
         return None
     noise, cells = prepared.unseen.noise_rms, together(prepared)
-    # All are judged with cells as the best thickness shapes them.
-    whole = in_all_cells(unseen_too(prepared, found.point, cells), cells)
-    before, after = (CellPart(_fitted(prepared, one.point, whole), noise) for one in (prepared.null, found))
-    told = Unseen(
-        before.point.cost - after.point.cost,
-        before.rms,
-        after.rms,
-        waves_gain=_gain_of_waves(prepared, found),
-    )
+    whole = _whole(prepared, found.point)
+    shape = whole.problem.forward.shape  # all are judged with cells as the best thickness shapes them
+    after = CellPart(_fitted(prepared, whole, shape), noise)
+    before = CellPart(_fitted(prepared, unseen_too(prepared, prepared.point, cells), shape), noise)
+    gain = before.point.cost - after.point.cost
+    told = Unseen(gain, before.rms, after.rms, waves_gain=_gain_of_waves(prepared, found))
     rival = stand_in(CellPart(with_corrections(prepared.point), noise), len(found.items))
     if rival is None:
         return told
-    other = _fitted(prepared, rival.point, whole)
+    other = _fitted(prepared, unseen_too(prepared, rival.point, cells), shape)
     return replace(told, stand_in=rival.words, stand_in_gain=before.point.cost - other.cost)
 
 
-def _fitted(prepared: Prepared, found: Point, whole: Point) -> Point:
+def _whole(prepared: Prepared, found: Point) -> Point:
+    """A fit to the part searched, at all cells, which have the shape of their thickness there."""
+    cells = together(prepared)
+    return in_all_cells(unseen_too(prepared, found, cells), cells)
+
+
+def _fitted(prepared: Prepared, point: Point, shape: CellShape) -> Point:
     """The held out cells with the effects of a point as they are; levels and cells are their own.
 
-    ``whole``: a point whose cells have their shape.
+    ``point``: at all cells. ``shape``: that of the cells.
     """
-    start = unseen_too(prepared, found, together(prepared)).thickness_um
-    forward = replace(found.problem.forward, shape=whole.problem.forward.shape)
-    problem = replace(found.problem, data=data_of(prepared.unseen), forward=forward, thickness_um=start)
-    return in_own_cells(problem.at(found.settings, found.levels, start))
+    forward, start = replace(point.problem.forward, shape=shape), point.thickness_um
+    problem = replace(point.problem, data=data_of(prepared.unseen), forward=forward, thickness_um=start)
+    return in_own_cells(problem.at(point.settings, point.levels, start))
 
 
 def _gain_of_waves(prepared: Prepared, found: Hypothesis) -> float:
