@@ -46,7 +46,7 @@ def void(name: str, gap_nm: float, x: float, y: float, radius: float) -> dict[st
 def flats_of(rng: np.random.Generator, effects: dict[str, float]) -> FringeCube:
     """Flats of pixels that see all of their area, with photon noise; the optics are the package's own."""
     coarse, fine = np.arange(float(SIDE)), (np.arange(3.0 * SIDE) + 0.5) / 3.0 - 0.5
-    thickness = random_field((SIDE, SIDE), rng, mean=15.0, span=1.5)
+    thickness = random_field((SIDE, SIDE), rng, mean=float(rng.uniform(13.0, 19.0)), span=1.5)
     model = FringeModel.from_setup("ts8_e2v", effects)
     geometry = ImageGeometry((SIDE, SIDE), fine, fine, WAVELENGTHS, np.full(12, ELECTRONS))
     flats = model.flat_image(RectBivariateSpline(coarse, coarse, thickness)(fine, fine), geometry)
