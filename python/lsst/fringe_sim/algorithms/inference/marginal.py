@@ -40,7 +40,7 @@ class Problem:
     forward: Forward
     thickness_um: FloatArray  # (N,): the first thickness, about which that of a cell is Gaussian
     response_sigma: float  # prior of the response of a cell
-    thickness_sigma_um: float = 1.0  # some fringe orders, which pulls no cell
+    thickness_sigma_um: float = 10.0  # many fringe orders, which pulls no cell and favours no order
 
     def at(self, settings: Mapping[str, float], levels: FloatArray, thickness_um: FloatArray) -> Point:
         """The likelihood linearised about effects, levels ``(W,)`` and thickness ``(N,)``."""

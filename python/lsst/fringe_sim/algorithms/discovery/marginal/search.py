@@ -109,11 +109,17 @@ class SetSearch:
         self.say(f"best of {size}: {', '.join(top.effects)} (log evidence {gained:.1f})")
         return top if self._is_surely_better(top, best) else best
 
-    def settled(self, size: int) -> Hypothesis:
-        """The best set of so many effects at most after members were left out and exchanged."""
+    def settled(self, before: Hypothesis) -> Hypothesis:
+        """The best set of as many effects at most as one that was settled before the problem was judged again.
+
+        Members are left out and exchanged anew if another set is the best now.
+        """
+        size = len(before.effects)
         if size == 1:
             return self.larger(self.null)
-        best = self._settled(self._of_size(size)[0])
+        best = self._of_size(size)[0]
+        if set(best.effects) != set(before.effects):
+            best = self._settled(best)
         smaller = max(
             (one for one in self.pool.values() if len(one.effects) < len(best.effects)), key=self.posterior
         )
@@ -183,7 +189,9 @@ class SetSearch:
         for found in grown[: self.rules.beam]:
             point, order_um = found.point, found.point.problem.forward.order_um
             starts = [in_whole_orders(point, self.rules.class_width)]
-            starts += [point.moved(point.levels, point.thickness_um + turn * order_um) for turn in (-1.0, 1.0)]
+            starts += [
+                point.moved(point.levels, point.thickness_um + turn * order_um) for turn in (-1.0, 1.0)
+            ]
             for start in starts:
                 if start is not point:
                     self._keep(self._fit(found.effects, found.items, start))
