@@ -1,7 +1,7 @@
 """The gate of the new core: sensors that no version has seen, drawn by one seed after the last change of the code.
 
-``python -m benchmarks gate --seed N --nulls 30 --singles 30 --pairs 20 --minutes 10`` searches them in turn, as many as
-the processor time allows, and prints every outcome as soon as it is known. Noise is stated wrongly by up to 20 %.
+``python -m benchmarks gate --seed N --nulls 30 --singles 30 --pairs 20 --minutes 10`` searches them in turn, as many
+as the processor time allows, and prints every outcome as soon as it is known. Noise is stated wrongly by up to 20 %.
 """
 
 from __future__ import annotations
