@@ -125,7 +125,7 @@ def with_free_contrast(point: Point, rounds: int = 8, tolerance: float = 0.02) -
         own = point.columns(fringes[np.newaxis], point.steep[np.newaxis] / forward.contrast)
         columns = joined(point.level_columns, own)
         gradient = point.score(columns) - columns.log_det
-        step = np.linalg.solve(point.information(columns, columns), gradient)
+        step = np.asarray(np.linalg.solve(point.information(columns, columns), gradient), dtype=float)
         moved = np.clip(point.followed_um(step, columns), -MOST_STEP_UM, MOST_STEP_UM)
         for part in SHRINK:
             contrast = max(forward.contrast + part * float(step[-1]), LEAST_LEFT * forward.contrast)

@@ -139,8 +139,9 @@ class MarginalSearch:
     def _is_judged_with_alike(self, best: Hypothesis) -> bool:
         """Whether noise and cells are those that a set of the same class leaves."""
         last = self.sets.pool.get(frozenset(self._judged_with[-1])) if self._judged_with else None
-        same = last is not None and len(last.effects) == len(best.effects)
-        return same and best.log_evidence - last.log_evidence < self.rules.class_width
+        if last is None or len(last.effects) != len(best.effects):
+            return False
+        return best.log_evidence - last.log_evidence < self.rules.class_width
 
     def _at_ends(self, best: Hypothesis) -> list[str]:
         """Parameters at an end of their range that nature does not have."""
