@@ -10,7 +10,7 @@ from pathlib import Path
 
 from . import _table
 
-ALONE = ("panel", "demo")
+ALONE = ("panel", "demo", "gate")
 """Not among those that run by default: they take long, have arguments of their own and say whether they failed."""
 
 

@@ -40,7 +40,7 @@ class Problem:
     forward: Forward
     thickness_um: FloatArray  # (N,): the first thickness, about which that of a cell is Gaussian
     response_sigma: float  # prior of the response of a cell
-    thickness_sigma_um: float | FloatArray = 1.0  # of all or of each; some fringe orders, which pulls no cell
+    thickness_sigma_um: float | FloatArray = 10.0  # of all or each; many orders pull no cell and favour none
 
     def at(self, settings: Mapping[str, float], levels: FloatArray, thickness_um: FloatArray) -> Point:
         """The likelihood linearised about effects, levels ``(W,)`` and thickness ``(N,)``."""

@@ -48,6 +48,9 @@ RIDGE_SCALES = 10.0
 MOST_TURNS, PARTS = 2, (9, 5, 3, 1)
 """Whole orders by which cells are moved, and sides of the parts of a sensor that are moved together [cells]."""
 
+PART_BACK = 5
+"""Side of the parts of a sensor that go back to the first thickness [cells]."""
+
 LEAST_GAIN, LEAST_PART = 0.03, 0.01
 """Gain of log likelihood, and part of what a fit lacks of another, with which steps end."""
 
@@ -122,7 +125,7 @@ def with_free_contrast(point: Point, rounds: int = 8, tolerance: float = 0.02) -
         own = point.columns(fringes[np.newaxis], point.steep[np.newaxis] / forward.contrast)
         columns = joined(point.level_columns, own)
         gradient = point.score(columns) - columns.log_det
-        step = np.linalg.solve(point.information(columns, columns), gradient)
+        step = np.asarray(np.linalg.solve(point.information(columns, columns), gradient), dtype=float)
         moved = np.clip(point.followed_um(step, columns), -MOST_STEP_UM, MOST_STEP_UM)
         for part in SHRINK:
             contrast = max(forward.contrast + part * float(step[-1]), LEAST_LEFT * forward.contrast)
@@ -173,14 +176,24 @@ def in_best_orders(point: Point, where: NDArray[np.bool_] | None = None, rounds:
     ``where`` (N,): cells that may move; the others stay.
     """
     order_um = point.problem.forward.order_um
-    return _in_best_minima(point, [point.thickness_um + shift * order_um for shift in SHIFTS], where, rounds)
+    moves = np.ones(len(point.thickness_um)) if where is None else where.astype(float)
+    best, energy = point.thickness_um.copy(), point.cell_energy.copy()
+    for shift in SHIFTS:
+        own = point.moved(point.levels, point.thickness_um + shift * order_um * moves)
+        for number in range(rounds + 1):
+            better = own.cell_energy < energy
+            best[better], energy[better] = own.thickness_um[better], own.cell_energy[better]
+            if number < rounds:
+                step = np.clip(own.wanted_um, -MOST_STEP_UM, MOST_STEP_UM)
+                own = own.moved(own.levels, own.thickness_um + step * moves)
+    return point.moved(point.levels, best)
 
 
 def in_whole_orders(point: Point, odds: float, rounds: int = 2) -> Point:
     """All of the sensor, then parts of it, in the fringe orders in which the cells together are the likeliest.
 
-    A part is a cell with its neighbours, or alone if it is sure. ``odds``: logarithm of those for which a part is moved;
-    that it is one of so many parts which is in another order is the less likely, the more parts there are.
+    A part is a cell with its neighbours, or alone if it is sure. ``odds``: logarithm of those for which a part is
+    moved; that it is one of so many parts which is in another order is the less likely, the more parts there are.
     """
     shape, order_um = point.problem.forward.geometry.sample_shape, point.problem.forward.order_um
     turns = np.arange(-MOST_TURNS, MOST_TURNS + 1)
@@ -205,26 +218,6 @@ def in_whole_orders(point: Point, odds: float, rounds: int = 2) -> Point:
     return point if (turns[best] == 0).all() else point.moved(point.levels, thickness[best, cells])
 
 
-def _in_best_minima(
-    point: Point,
-    starts: Sequence[FloatArray],
-    where: NDArray[np.bool_] | None = None,
-    rounds: int = 4,
-) -> Point:
-    """The thickness of every cell at the best to which these lead, each ``(N,)`` [µm], or where it is."""
-    moves = np.ones(len(point.thickness_um)) if where is None else where.astype(float)
-    best, energy = point.thickness_um.copy(), point.cell_energy.copy()
-    for start in starts:
-        own = point.moved(point.levels, point.thickness_um + (start - point.thickness_um) * moves)
-        for number in range(rounds + 1):
-            better = own.cell_energy < energy
-            best[better], energy[better] = own.thickness_um[better], own.cell_energy[better]
-            if number < rounds:
-                step = np.clip(own.wanted_um, -MOST_STEP_UM, MOST_STEP_UM)
-                own = own.moved(own.levels, own.thickness_um + step * moves)
-    return point.moved(point.levels, best)
-
-
 def _typical_um(point: Point, moved_um: FloatArray) -> float:
     """Median distance that cells with data are moved [µm]."""
     return float(np.median(np.abs(moved_um[point.problem.data.seen])))
@@ -241,15 +234,28 @@ def fit(
 ) -> Hypothesis:
     """The best parameters, levels and thickness from a start, by steps that lower the cost.
 
-    Cells may go back to the first thickness: on the way from other effects some are left in other minima. ``aim``:
+    Parts may go back to the first thickness: on the way from other effects some are left in other minima. ``aim``:
     cost that others have reached; a fit that is far behind ends when its steps are short beside what it lacks, and
     any fit when a step gains less than ``tolerance``.
     """
     point = _walked(items, _started(items, start), rounds, aim, tolerance)
-    back = _in_best_minima(point, [point.problem.thickness_um])
+    back = _gone_back(point)
     if point.cost - back.cost > _tolerance(back, aim, tolerance):
         point = _walked(items, back, rounds, aim, tolerance)
     return _hypothesis(effects, items, point)
+
+
+def _gone_back(point: Point, rounds: int = 4) -> Point:
+    """The thickness at the best to which the first one leads, where cells and their neighbours are likelier there.
+
+    A cell alone would follow its noise to another order.
+    """
+    own = point.moved(point.levels, point.problem.thickness_um)
+    for _ in range(rounds):
+        own = own.moved(own.levels, own.thickness_um + np.clip(own.wanted_um, -MOST_STEP_UM, MOST_STEP_UM))
+    gained = (point.cell_energy - own.cell_energy).reshape(point.problem.forward.geometry.sample_shape)
+    better = uniform_filter(gained, PART_BACK, mode="constant").ravel() > 0.0
+    return point.moved(point.levels, np.where(better, own.thickness_um, point.thickness_um))
 
 
 def _tolerance(point: Point, aim: float, least: float) -> float:

@@ -178,7 +178,7 @@ def _in_cells(
 
 
 def _with_likelier_pixels(point: Point, rules: Rules) -> Point:
-    """The same where pixels see the point in their middle instead of all of their area, or the reverse, if likelier."""
+    """The same with pixels that see the point in their middle, not all of their area, or the reverse, if likelier."""
     forward = point.problem.forward
     shape = replace(forward.shape, area=not forward.shape.area)
     problem = replace(point.problem, forward=replace(forward, shape=shape))

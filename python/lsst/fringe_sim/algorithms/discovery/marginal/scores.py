@@ -24,6 +24,10 @@ WIDTHS = np.geomspace(0.03, 30.0, 13)
 """Widths of the prior, in its scales, over which a score is the best: departures may be of any size."""
 
 
+FIRST_ROUNDS = 2
+"""Steps of the thickness after which places that an effect proposes are compared."""
+
+
 @dataclass(frozen=True, eq=False)
 class Scored:
     """An effect that could be added, by one derivative."""
@@ -127,6 +131,8 @@ def proposed(effect: Effect, items: tuple[Coordinate, ...], base: Hypothesis) ->
             best = start
     if best is None:
         return None
+    if effect.local:
+        best = in_best_orders(best, _covered(effect, items, best))
     step = np.array([best.settings[item.key] - item.null for item in items])
     change = point.projected(best.whitened(best.value) - point.whitened(point.value)).ravel()
     unit = change / max(float(np.linalg.norm(change)), 1e-300)
@@ -138,7 +144,12 @@ def _begun(effect: Effect, items: tuple[Coordinate, ...], values: dict[str, floa
     """A proposal with the thickness that goes with it; that of an island may lie anywhere within an order."""
     if not effect.local:
         return jumped(point, items, [values[item.parameter] for item in items])
-    forward = point.problem.forward
     settings = {**point.settings, **{item.key: item.clipped(values[item.parameter]) for item in items}}
-    there = effect.coverage(values, forward.geometry).ravel() > 0.0
-    return in_best_orders(point.moved(point.levels, point.thickness_um, settings), there)
+    start = point.moved(point.levels, point.thickness_um, settings)
+    return in_best_orders(start, _covered(effect, items, start), rounds=FIRST_ROUNDS)
+
+
+def _covered(effect: Effect, items: tuple[Coordinate, ...], point: Point) -> NDArray[np.bool_]:
+    """Cells in which a local effect is."""
+    values = {item.parameter: point.settings[item.key] for item in items}
+    return np.asarray(effect.coverage(values, point.problem.forward.geometry).ravel() > 0.0)

@@ -138,11 +138,17 @@ class SetSearch:
         self.say(f"best of {size}: {', '.join(top.effects)} (log evidence {gained:.1f})")
         return top if self._is_surely_better(top, best) else best
 
-    def settled(self, size: int) -> Hypothesis:
-        """The best set of so many effects at most after members were left out and exchanged."""
+    def settled(self, before: Hypothesis) -> Hypothesis:
+        """The best set of as many effects at most as one that was settled before the problem was judged again.
+
+        Members are left out and exchanged anew if another set is the best now.
+        """
+        size = len(before.effects)
         if size == 1:
             return self.larger(self.null)
-        best = self._settled(self._of_size(size)[0])
+        best = self._of_size(size)[0]
+        if set(best.effects) != set(before.effects):
+            best = self._settled(best)
         smaller = max(
             (one for one in self.pool.values() if len(one.effects) < len(best.effects)), key=self.posterior
         )

@@ -146,7 +146,7 @@ class MarginalSearch:
             self.report(f"noise and cells are judged again with {', '.join(best.effects)}")
             prepared = prepare_again(self.prepared, best, self.rules)
             self.sets, self.prepared = self.sets.on(prepared.null), prepared
-            best = self.sets.settled(len(best.effects))
+            best = self.sets.settled(best)
         return best
 
     def _is_judged_with_alike(self, best: Hypothesis) -> bool:
