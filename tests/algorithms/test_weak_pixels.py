@@ -65,6 +65,15 @@ def test_width_is_that_of_the_place(together, rng) -> None:
     assert np.sqrt(np.mean(found[9:, 9:] ** 2)) < 1.5
 
 
+@pytest.mark.rng("weak pixels whose scatter noise hides")
+def test_scatter_that_noise_hides_is_no_width(rng) -> None:
+    """Pixels of 256 cells might scatter by 4 beyond a noise of 90, which neither shows nor excludes it."""
+    away = 90.0 * rng.standard_normal((128, 128))
+    away -= np.kron(away.reshape(16, 8, 16, 8).mean(axis=(1, 3)), np.ones((8, 8)))
+    found = np.sqrt(local_variance(leanings(away, 90.0), np.zeros((16, 16)), (0.7, 150.0)))
+    assert np.sqrt(np.mean(found**2)) < 2.0
+
+
 @pytest.mark.rng("weak pixels noise of the surface")
 def test_noise_of_the_surface_is_no_width(rng) -> None:
     """Cells are off by as much as the noise of their surface says."""
@@ -130,6 +139,61 @@ def test_cells_beyond_a_crest_come_back(rng) -> None:
     assert np.abs(found.terms[..., 0] - truth).max() < 0.006
     pull = (found.terms[..., 0] - truth) / found.sigma_um
     assert 0.5 < np.sqrt(np.mean(pull**2)) < 1.5
+
+
+def cells_of(truth: np.ndarray, noise: float, rng: np.random.Generator) -> tuple[Cells, FringeTemplates]:
+    """Cells of 8 by 8 pixels with fringes at three wavelengths that never have their crests together."""
+    grid = 14.0 + 0.001 * np.arange(1500)
+    phase = 2.0 * np.pi * grid[:, None] / ORDER_UM + np.array([0.0, 2.0, 4.0])
+    templates = FringeTemplates(1.0 + 0.1 * np.cos(phase), 14.0, 0.001, np.array([930.0, 931.0, 932.0]))
+    edges = 8 * np.arange(len(truth) + 1)
+    value, weight = (np.zeros((*truth.shape, 8), np.float32) for _ in range(2))
+    amplitude = templates.amplitude_at(truth.ravel()).T.reshape(*truth.shape, 3)
+    value[..., :3] = amplitude + noise * rng.standard_normal(amplitude.shape)
+    weight[..., :3] = noise**-2.0
+    return Cells(value, weight, np.zeros_like(value), np.zeros_like(value), edges, edges), templates
+
+
+@pytest.mark.parametrize("step_um", [0.0, 0.045])
+@pytest.mark.rng("weak pixels surface across a step")
+def test_a_surface_across_a_step_is_believed_less(step_um, rng) -> None:
+    """A step of 0.15 orders, as large as six times what noise does to a cell, and none."""
+    y, x = np.indices((24, 24))
+    beside = np.abs(x - 11.5) < 1.0
+    truth = 14.6 + 0.004 * y + step_um * (x > 11.5)
+    cells, templates = cells_of(truth, 0.02, rng)
+    flat, every = np.zeros(truth.shape, np.float32), np.ones(truth.shape, bool)
+    known = flat + np.float32(0.0075)
+    at = (cells.y_centre, cells.x_centre)
+    surface = CellSurface(truth.astype(np.float32), flat, flat, *at, every, every, known)
+    found = local_surface(surface, cells, templates, every, ORDER_UM)
+    error, inside = found.terms[..., 0] - truth, (y > 1) & (y < 22)
+    pulls = [np.sqrt(np.mean((error / found.sigma_um)[part & inside] ** 2)) for part in (beside, ~beside)]
+    assert 0.6 < pulls[0] < 1.5
+    assert 0.8 < pulls[1] < 1.3
+    assert (np.median(found.sigma_um[beside]) > 2.0 * np.median(found.sigma_um[x < 8])) == (step_um > 0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ridge", [False, True])
+@pytest.mark.rng("weak pixels about a step or a ridge")
+def test_weak_pixels_about_a_step(ridge, rng) -> None:
+    """Flats of the other simulator at a contrast of 0.13 and 6,000 electrons: a step of 0.15 orders, and a ridge."""
+    y, x = np.indices((160, 160))
+    across = (x + 0.35 * y - 104.0) / np.hypot(1.0, 0.35)
+    rise = 0.06 * np.exp(-0.5 * (across / 3.0) ** 2) if ridge else 0.045 * (across > 0.0)
+    truth = random_field((160, 160), rng, mean=14.0, span=1.5) + rise
+    cube = make_flats(replace(ROWS["contrast 0.13"], electrons=6_000.0), truth, rng)
+    fitted = fit_thickness(cube, FringeModel.from_setup("ts8_e2v"))
+    good, near = fitted.mask == 0, np.abs(across) < 5.0
+    assert good.mean() > 0.9
+    assert np.mean(np.abs(fitted.value - truth)[good] > 0.5 * ORDER_UM) < 1e-3
+    good &= np.abs(fitted.value - truth) < 0.5 * ORDER_UM
+    shared = fitted.metadata["SCALESIG"] * fitted.value
+    error = fitted.value - truth - np.mean((fitted.value - truth)[good])
+    pull = error / np.sqrt(fitted.sigma**2 - shared**2)
+    assert np.sqrt(np.mean(pull[good & near] ** 2)) < 1.3
+    assert 0.8 < np.sqrt(np.mean(pull[good & ~near] ** 2)) < 1.15
 
 
 @pytest.mark.slow

@@ -351,7 +351,7 @@ class _Problem:
         each, common = self._design(fit, thickness, model, slope)
         lean = (self.cells.weight[:, :wavelengths] * slope).T
         information = np.maximum((lean * slope.T).sum(axis=0), 1e-30)
-        moves = (each * lean[:, None]).reshape(wavelengths * self.own, -1)
+        moves = (each * lean[:, None]).reshape(wavelengths * self.own, thickness.size)
         moves = np.concatenate([moves, (common * lean[:, None]).sum(axis=0)]) / information
         if self.free.wavelength_accuracy_nm > 0.0:  # what is common to them is the scale
             along, place = self._along(fit), np.arange(self.own - 1, wavelengths * self.own, self.own)
