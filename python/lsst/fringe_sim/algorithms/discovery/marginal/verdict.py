@@ -234,7 +234,8 @@ class MarginalSearch:
             return self.sets.posterior(one) + best_evidence(self._part(one))
 
         def smaller(one: Hypothesis) -> list[Hypothesis]:
-            return [self.sets.without(one, name) for name in one.effects]
+            leave = [name for name in one.effects if self.catalogue.may_leave((name,), one.effects)]
+            return [self.sets.without(one, name) for name in leave]
 
         try:
             with time_limit(self.until):
