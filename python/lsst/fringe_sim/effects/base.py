@@ -35,8 +35,7 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
-Values = Mapping[str, float]
-"""Values of parameters by their names."""
+Values = Mapping[str, float]  # Values of parameters by their names
 
 
 @named_units

@@ -13,28 +13,21 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from .base import FloatArray, Residuals
 from .geometry import ImageGeometry
 
-__all__ = ["Disc", "Discs", "find_disc", "find_step"]
-
 SMALLEST_RADIUS, LARGEST_PART, RADIUS_RATIO = 2.0, 0.35, 1.2
 """Radii that are tried: the smallest [cells], the largest over the shorter side, and one over the one before."""
 
-FINE_RATIO = 1.05
-"""The last of these where nothing but the power tells the radius."""
-
-LEAST_SEEN = 0.3
-"""Part of a disc that must lie on cells with data."""
+FINE_RATIO = 1.05  # The last of these where nothing but the power tells the radius
+LEAST_SEEN = 0.3  # Part of a disc that must lie on cells with data
 
 MOST_EXCESS = 4.0
 """Excess over the noise that counts in one sample: it matters where something is left, not how much."""
 
-SMALLEST_STEP = 2.8
-"""Radius of the smallest disc of which no smooth thickness takes up all [cells]."""
+SMALLEST_STEP = 2.8  # Radius of the smallest disc of which no smooth thickness takes up all [cells]
 
 CHANCE = 1e-3
 """Chance that noise has a step of the thickness somewhere, below which there is one; as that of the critics."""
 
-QUIET_QUARTER = 0.3186
-"""Quarter of the absolute values of a Gaussian of unit width lies below."""
+QUIET_QUARTER = 0.3186  # Quarter of the absolute values of a Gaussian of unit width lies below
 
 Disc = tuple[float, float, float, float]
 """Fall of χ² that a disc promises, its row, column and radius [cells]."""

@@ -15,8 +15,7 @@ LEAST_SLANT = 1e-3
 """Sides of the ramp that the rim of a disc has in a pixel [px], where it runs along the pixel's own side."""
 
 
-SIZES_PER_REPETITION = 12
-"""Gaps that are tried, up to one at which the fringes look nearly the same again."""
+SIZES_PER_REPETITION = 12  # Gaps that are tried, up to one at which the fringes look nearly the same again
 
 THIN = (0.01, 0.02, 0.04, 0.08)
 """Smaller ones, in units of that, where all that is seen is a step of the thickness."""

@@ -6,19 +6,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import BoolArray, FloatArray
 from ...effects import ImageGeometry
 from .channels import State
 from .fit import Columns, Design, Fit, Problem, Projected, fit_model, linearise_at
 from .learned_columns import with_learned
 from .learning import Learned, Part, best_evidence, judging_cells, learn
 from .validation import misfit_rms, thickness_starts
-
-__all__ = ["evidence_of_correction", "learned_beside"]
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 def learned_beside(

@@ -35,14 +35,7 @@ from .next_step import Values
 class FrameForecast:
     """Information of frames that are there, and of data that could be taken, about effects of a class.
 
-    Parameters
-    ----------
-    problem : `Problem`
-        The frames.
-    fit : `Fit`
-        Fit of the named effects to them.
-    coordinates : mapping
-        Coordinates of every effect of the catalogue.
+    ``coordinates``: coordinates of every effect of the catalogue.
     """
 
     def __init__(self, problem: Problem, fit: Fit, coordinates: Mapping[str, tuple[Coordinate, ...]]) -> None:

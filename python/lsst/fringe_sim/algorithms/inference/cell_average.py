@@ -8,24 +8,18 @@ from functools import cached_property
 
 import numpy as np
 from numpy.polynomial.hermite_e import hermegauss
-from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 from scipy.special import erf
 
+from ...array_types import FloatArray
 from ...compiled import contiguous, kernel
 
-__all__ = ["CellShape", "look_up"]
-
-FloatArray = NDArray[np.float64]
-
-LEAST_SPREAD_UM2 = 1e-14
-"""Variance of the thickness in a cell that is rounding [µm²]."""
+LEAST_SPREAD_UM2 = 1e-14  # Variance of the thickness in a cell that is rounding [µm²]
 
 STIFFNESSES, BISECTIONS = (1e-4, 1e10), 30
 """Least and largest weight of third differences, and how often the range is halved."""
 
-BLURRED_PLACES = 7
-"""Places that stand for a blur: a Gaussian of 2 rad rms of fringe phase is right to 1e-3."""
+BLURRED_PLACES = 7  # Places that stand for a blur: a Gaussian of 2 rad rms of fringe phase is right to 1e-3
 
 MOST_BENT = 0.4, 0.06
 """Largest skewness over 6 and excess over 24 of them; where fringes are at rest they mean nothing."""

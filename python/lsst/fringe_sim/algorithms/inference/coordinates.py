@@ -65,10 +65,7 @@ class Coordinate:
 def coordinates_of(effect: Effect, forward: Forward) -> tuple[Coordinate, ...]:
     """Coordinates of all parameters of an effect that the exposures see.
 
-    Raises
-    ------
-    InputError
-        The effect cannot be looked for on these samples.
+    Raises `InputError`: the effect cannot be looked for on these samples.
     """
     effect.check_search(forward.geometry)
     nulls, hints = effect.null_values(forward.model.base_system), effect.search

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import FloatArray
 from ...effects import Effect, ImageGeometry, activate_effects, apply_to_image
 from ...effects.active import another
 from ...model import FringeModel
@@ -17,9 +17,6 @@ from ...optics.illumination import Illumination
 from ..discovery.evaluations import note_evaluation
 from .cell_average import CellShape, look_up
 
-__all__ = ["Forward"]
-
-FloatArray = NDArray[np.float64]
 Settings = Mapping[str, float]
 _Key = tuple[tuple[str, float], ...]
 
@@ -29,45 +26,29 @@ TABLE_STEP_UM = 0.004
 TABLE_TOLERANCE = 1e-9
 """Error of the tables relative to the fringes; derivatives are differences of tables 1e-3 of a prior scale apart."""
 
-LINE_STEP_NM = 0.1
-"""Spacing of wavelength nodes [nm]."""
+LINE_STEP_NM = 0.1  # Spacing of wavelength nodes [nm]
 
 NUDGE_UM = 1e-3
 """Change of thickness with which effects on the image are differentiated [µm]; they are nearly linear."""
 
-MOST_TABLES = 400
-"""Tables kept for reuse; which of them are there changes no answer."""
+MOST_TABLES = 400  # Tables kept for reuse; which of them are there changes no answer
 
 
 @dataclass(frozen=True, eq=False)
 class Forward:
-    """Model of one sensor on cells.
+    """Model of one sensor on cells."""
 
-    Attributes
-    ----------
-    model : `FringeModel`
-        The model as it is known before the search.
-    catalogue : sequence of `Effect`
-        Effects that may be set.
-    geometry : `ImageGeometry`
-        Centres of the cells, wavelengths, levels.
-    shape : `CellShape`
-        What the thickness does within the cells.
-    range_um : `tuple` [`float`, `float`]
-        Thicknesses of the tables [µm]; the light is relative to its tapered mean over them, whatever is asked.
-    centroid : `numpy.ndarray`, shape ``(2, W, N)``, optional
-        Where the good pixels of a cell have their mean, from its centre [px].
-    contrast : `float`
-        Contrast of the fringes over that of the model; 1 but while noise and cells are judged.
-    """
-
-    model: FringeModel
-    catalogue: Sequence[Effect]
-    geometry: ImageGeometry
-    shape: CellShape
+    model: FringeModel  # the model as it is known before the search
+    catalogue: Sequence[Effect]  # effects that may be set
+    geometry: ImageGeometry  # centres of the cells, wavelengths, levels
+    shape: CellShape  # what the thickness does within the cells
+    # thicknesses of the tables [µm]; the light is relative to its tapered mean over them, whatever is asked
     range_um: tuple[float, float]
+    # where the good pixels of a cell have their mean, from its centre [px], ``(2, W, N)``
     centroid: FloatArray | None = None
-    contrast: float = 1.0
+    contrast: float = (
+        1.0  # contrast of the fringes over that of the model; 1 but while noise and cells are judged
+    )
     _tables: dict[_Key, FloatArray] = field(default_factory=dict, repr=False)
     _rows: dict[tuple[_Key, int, float], FloatArray] = field(default_factory=dict, repr=False)
     _by_name: dict[str, Effect] = field(default_factory=dict, repr=False)

@@ -7,16 +7,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import BoolArray, FloatArray
 from .forward import Forward
 
-__all__ = ["Columns", "Data", "Point", "Problem"]
-
-FloatArray = NDArray[np.float64]
-
-SECOND_STEP_UM = 1e-3
-"""Change of thickness with which the slope is differentiated [µm]."""
+SECOND_STEP_UM = 1e-3  # Change of thickness with which the slope is differentiated [µm]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +22,7 @@ class Data:
     weight: FloatArray  # (W, N)
 
     @property
-    def seen(self) -> NDArray[np.bool_]:
+    def seen(self) -> BoolArray:
         """Cells with data, ``(N,)``."""
         return np.asarray((self.weight > 0.0).any(axis=0))
 

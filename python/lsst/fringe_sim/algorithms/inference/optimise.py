@@ -7,34 +7,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
+from ...array_types import BoolArray, FloatArray
 from ...errors import OutOfRangeError
 from .coordinates import SECANT, Coordinate, log_evidence_of_parameters
 from .marginal import Columns, Point, joined
 
-__all__ = [
-    "Hypothesis",
-    "effect_columns",
-    "fit",
-    "in_best_orders",
-    "in_whole_orders",
-    "jumped",
-    "relaxed",
-    "with_free_contrast",
-]
-
-FloatArray = NDArray[np.float64]
-
-MOST_STEP_UM = 0.05
-"""Farthest that a step moves the thickness of a cell [µm]: a sixth of a fringe order."""
+MOST_STEP_UM = 0.05  # Farthest that a step moves the thickness of a cell [µm]: a sixth of a fringe order
 
 MOST_JUMP_UM = 0.25
 """The same of a finite change of an effect, whose thickness may have to follow by most of an order."""
 
-LEAST_LEFT = 0.3
-"""Part of the contrast that a step leaves at least."""
+LEAST_LEFT = 0.3  # Part of the contrast that a step leaves at least
 
 STRIDE_UM, MOST_STRIDES = 0.05, 16
 """Typical length of a stride of the thickness [µm], and how many of them are walked at most."""
@@ -48,14 +33,12 @@ RIDGE_SCALES = 10.0
 MOST_TURNS, PARTS = 2, (9, 5, 3, 1)
 """Whole orders by which cells are moved, and sides of the parts of a sensor that are moved together [cells]."""
 
-PART_BACK = 5
-"""Side of the parts of a sensor that go back to the first thickness [cells]."""
+PART_BACK = 5  # Side of the parts of a sensor that go back to the first thickness [cells]
 
 LEAST_GAIN, LEAST_PART = 0.03, 0.01
 """Gain of log likelihood, and part of what a fit lacks of another, with which steps end."""
 
-SHRINK = (1.0, 0.4, 0.12, 0.03)
-"""Parts of a step that are tried."""
+SHRINK = (1.0, 0.4, 0.12, 0.03)  # Parts of a step that are tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +153,7 @@ def jumped(point: Point, items: Sequence[Coordinate], values: Sequence[float]) -
     return relaxed(point, rounds=2)
 
 
-def in_best_orders(point: Point, where: NDArray[np.bool_] | None = None, rounds: int = 4) -> Point:
+def in_best_orders(point: Point, where: BoolArray | None = None, rounds: int = 4) -> Point:
     """The thickness of every cell where it is best of all within half an order, at these levels.
 
     ``where`` (N,): cells that may move; the others stay.

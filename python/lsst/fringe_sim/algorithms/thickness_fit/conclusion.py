@@ -17,32 +17,17 @@ from .pixels import PixelFit
 from .templates import FringeTemplates
 from .wavelengths import spread_of_wavelengths
 
-__all__ = [
-    "CERTAIN",
-    "MISFIT",
-    "contrast_map",
-    "flat_fit",
-    "model_error",
-    "remarks",
-    "says_misfit",
-    "slope_cards",
-]
-
 CERTAIN = 25.0
 """Chi-square difference to the next order of the whole sensor below which the order is not decided: flats that the
 model does not describe have shown 19 for an order that was wrong."""
 MISFIT = 1.1**2
 """Mean square of what is left of small blocks of pixels, over their variance, from which on the model is said not to
 fit: it makes uncertainties larger by more than the tenth to which they are stated."""
-_OUTLIER = 5.0
-"""Standard deviations beyond which a wavelength does not belong to its label."""
-_BLOCKS = 16
-"""Blocks along a side of the sensor at most in the map of the contrast."""
-_BLOCK_PX = 32
-"""Side of the blocks over which model error is judged [px]."""
+_OUTLIER = 5.0  # Standard deviations beyond which a wavelength does not belong to its label
+_BLOCKS = 16  # Blocks along a side of the sensor at most in the map of the contrast
+_BLOCK_PX = 32  # Side of the blocks over which model error is judged [px]
 _SIGNIFICANT = 3.0
-_SOME = 512
-"""Rows and columns of which slopes are taken."""
+_SOME = 512  # Rows and columns of which slopes are taken
 
 
 def model_error(
@@ -53,14 +38,8 @@ def model_error(
     What a wrong model leaves over is the same in neighbouring pixels; in the direction of the thickness, where it
     cannot be seen, it is taken to be as large as in the others.
 
-    Parameters
-    ----------
-    pixels : `PixelFit`
-        The fit; its uncertainties are changed in place.
-    scale_sigma : `float`
-        Standard uncertainty of the scale of the thickness.
-    learned_sigma_um : `numpy.ndarray`, float32, shape ``(ny, nx)``, optional
-        Standard uncertainty of the thickness from the nuisances [µm].
+    ``scale_sigma``: standard uncertainty of the scale of the thickness; ``learned_sigma_um``: standard uncertainty
+    of the thickness from the nuisances [µm], float32, ``(ny, nx)``.
     """
     most = int(pixels.n_wavelengths.max(initial=0))
     if most < 3:
@@ -100,14 +79,7 @@ def contrast_map(
 ) -> NDArray[np.float32]:
     """Contrast in blocks of cells over that of the templates, the thickness of each cell being free.
 
-    Parameters
-    ----------
-    cells : `Cells`
-        Mean amplitudes under even light.
-    templates : `FringeTemplates`
-        The model with its contrast.
-    thickness_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Thickness of the cells [µm].
+    ``thickness_um``: thickness of the cells [µm], float32, ``(ncy, ncx)``.
     """
     wavelengths = templates.n_wavelengths
     rows, columns = (np.array_split(np.arange(n), min(_BLOCKS, n)) for n in cells.shape)
@@ -217,12 +189,7 @@ def says_misfit(metadata: Mapping[str, Any]) -> bool:
 def remarks(metadata: Mapping[str, Any], flats: FlatFit | None) -> list[str]:
     """What a person should know of a fit first, in sentences.
 
-    Parameters
-    ----------
-    metadata : mapping
-        Header of a thickness map.
-    flats : `FlatFit` or `None`
-        What was learned of each flat.
+    ``metadata``: header of a thickness map; ``flats``: what was learned of each flat.
     """
     if flats is None:
         return []

@@ -24,51 +24,27 @@ from .solver import Solver, surface_of
 from .templates import FringeTemplates
 from .weak_pixels import settle_weak_pixels
 
-__all__ = ["GlobalFit", "global_fit"]
-
 
 @dataclass(frozen=True, eq=False)
 class GlobalFit:
-    """What the global fit found.
+    """What the global fit found."""
 
-    Attributes
-    ----------
-    pixels : `PixelFit`
-        Value, uncertainty, chi-square of every pixel.
-    cells : `Cells`
-        Averages that the orders were solved on.
-    settled : `SettledCells`
-        Order of every cell, and how sure it is.
-    border_slip : `numpy.ndarray`, float32, shape ``(ny, nx)``
-        Probability that a pixel near a step lies on the other side of it, or that one which was fitted by itself
-        has another order.
-    templates : `FringeTemplates`
-        The model as it was normalised in the end.
-    nuisance : `NuisanceFit`
-        Patterns and contrast beside the fringes.
-    order_um : `float`
-        Thickness of one fringe order [µm].
-    normalisation : `str`
-        ``sensor``, ``narrow`` or ``range``: over which thicknesses the mean response was taken. ``narrow`` is a
-        sensor of few orders, whose mean response was found together with its order.
-    common_slip : `float`
-        Probability that the sensor as a whole has another order.
-    margin : `float`
-        Chi-square by which the next best order of the whole sensor is worse, where nuisances are free.
-    contrast_map : `numpy.ndarray`, float32
-        Contrast in blocks of the sensor, over that of the sensor.
-    """
-
-    pixels: PixelFit
-    cells: Cells
-    settled: SettledCells
+    pixels: PixelFit  # value, uncertainty, chi-square of every pixel
+    cells: Cells  # averages that the orders were solved on
+    settled: SettledCells  # order of every cell, and how sure it is
+    # probability that a pixel near a step lies on the other side of it, or that one which was fitted by itself has
+    # another order, float32, ``(ny, nx)``
     border_slip: NDArray[np.float32]
-    templates: FringeTemplates
-    nuisance: NuisanceFit
-    order_um: float
+    templates: FringeTemplates  # the model as it was normalised in the end
+    nuisance: NuisanceFit  # patterns and contrast beside the fringes
+    order_um: float  # thickness of one fringe order [µm]
+    # ``sensor``, ``narrow`` or ``range``: over which thicknesses the mean response was taken. ``narrow`` is a
+    # sensor of few orders, whose mean response was found together with its order
     normalisation: str
-    common_slip: float = 0.0
+    common_slip: float = 0.0  # probability that the sensor as a whole has another order
+    # chi-square by which the next best order of the whole sensor is worse, where nuisances are free
     margin: float = np.inf
+    # contrast in blocks of the sensor, over that of the sensor, float32
     contrast_map: NDArray[np.float32] = field(default_factory=lambda: np.ones((1, 1), np.float32))
 
 
@@ -83,20 +59,9 @@ def global_fit(
 ) -> GlobalFit:
     """Fit a sensor.
 
-    Parameters
-    ----------
-    data : `Amplitudes`
-        The flats.
-    templates : `FringeTemplates`
-        The model; its grid must contain the range and half an order on both sides.
-    range_um : `tuple` [`float`, `float`]
-        Thicknesses that are possible [µm].
-    cell_px : `int`, optional
-        Size of the cells [px]; chosen from the steepness of the fringes if not given.
-    nuisances : `Nuisances`, optional
-        What else than thickness is free; nothing by default.
-    threads : `int`, optional
-        Number of threads; has no influence on the result.
+    ``templates``: the model; its grid must contain the range and half an order on both sides; ``range_um``:
+    thicknesses that are possible [µm]; ``cell_px``: size of the cells [px]; chosen from the steepness of the
+    fringes if not given.
     """
     _, ny, nx = data.shape
     nuisances = (nuisances or Nuisances()).fitting(ny, nx)

@@ -12,21 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import BoolArray, FloatArray
 from ...compiled import kernel
 from .newton import score
 
-__all__ = ["Leanings", "lean_strip", "local_variance", "most_likely_shares", "responsibility"]
-
-FloatArray = NDArray[np.float64]
-
-_WIDTHS = 8
-"""Widths that are tried of each kind: none, and others in equal ratios."""
-_MOST_CELLS = 4096
-"""Cells that show the distribution of widths of all."""
+_WIDTHS = 8  # Widths that are tried of each kind: none, and others in equal ratios
+_MOST_CELLS = 4096  # Cells that show the distribution of widths of all
 _ROUNDS, _ROUNDS_AROUND = 400, 4
 """Steps of expectation and maximisation for all cells, and of what the cells around one add."""
-_REACH = 2
-"""Cells on each side of one that are around it."""
+_REACH = 2  # Cells on each side of one that are around it
 _SQUARE = range(2 * _REACH + 1)
 _TINY = 1e-30
 _WEIGHTS = np.geomspace(0.5, 512.0, 11).astype(np.float32)
@@ -35,15 +29,10 @@ _WEIGHTS = np.geomspace(0.5, 512.0, 11).astype(np.float32)
 
 @dataclass(frozen=True, eq=False)
 class Leanings:
-    """What the pixels of each cell show about the surface.
+    """What the pixels of each cell show about the surface."""
 
-    Attributes
-    ----------
-    number, score, information, squares : `numpy.ndarray`, shape ``(ncy, ncx)``
-        Pixels; sums of their scores and of their information on the surface, and of the squares of the scores over
-        the information. Distances are in steps of the table.
-    """
-
+    # number, score, information, squares: pixels; sums of their scores and of their information on the surface, and
+    # of the squares of the scores over the information. Distances are in steps of the table, ``(ncy, ncx)``
     number: FloatArray
     score: FloatArray
     information: FloatArray
@@ -62,21 +51,9 @@ def local_variance(
     cells around each are believed besides, as far as they foretell it: how many of them all cells together count
     for is the most likely number.
 
-    Parameters
-    ----------
-    seen : `Leanings`
-        The cells.
-    surface_variance : `numpy.ndarray`, shape ``(ncy, ncx)``
-        Variance of the surface in each, from the noise of the cells.
-    widths : `tuple` [`float`, `float`]
-        Least and largest width that is tried.
-    independence : `float`, optional
-        Independent pixels per pixel of a cell: below 1 where noise is correlated.
-
-    Returns
-    -------
-    variance : `numpy.ndarray`, shape ``(ncy, ncx)``
-        0 where there are no pixels.
+    ``surface_variance``: variance of the surface in each, from the noise of the cells, ``(ncy, ncx)``; ``widths``:
+    least and largest width that is tried; ``independence``: independent pixels per pixel of a cell: below 1 where
+    noise is correlated. Returns 0 where there are no pixels, ``(ncy, ncx)``.
     """
     squares = np.concatenate([[0.0], np.geomspace(*widths, _WIDTHS - 1) ** 2])
     together, alone = (each.ravel() for each in np.meshgrid(squares, squares, indexing="ij"))
@@ -91,7 +68,7 @@ def local_variance(
     return out
 
 
-def _share_of_widths(likely: FloatArray, together: NDArray[np.bool_]) -> FloatArray:
+def _share_of_widths(likely: FloatArray, together: BoolArray) -> FloatArray:
     """Most likely share of each pair of widths; ``together`` are those where no pixel lies apart from its cell.
 
     Noise hides how far pixels scatter by themselves where that is little. That they do is believed if it makes the
@@ -120,7 +97,7 @@ def responsibility(likely: NDArray[np.floating], share: NDArray[np.floating]) ->
 
 
 def _with_neighbours(
-    likely: NDArray[np.float32], share: NDArray[np.float32], known: NDArray[np.bool_]
+    likely: NDArray[np.float32], share: NDArray[np.float32], known: BoolArray
 ) -> NDArray[np.float32]:
     """What is expected of each ``known`` cell before it is asked: ``share``, and what those around it show."""
     place = np.full(np.add(known.shape, 2 * _REACH), len(likely))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import BoolArray, FloatArray
 from .cells import Cells
 from .learning import moves_of
 from .learning_cells import LearningCells
@@ -17,19 +18,14 @@ from .nuisances import NuisanceFit, Nuisances, patterns_of_cells
 from .pixels import CellSurface
 from .templates import FringeTemplates
 
-__all__ = ["learned_sigma"]
-
-FloatArray = NDArray[np.float64]
-
-_MOST_PLACES = 32
-"""Places along a side of the sensor at which the surface is asked."""
+_MOST_PLACES = 32  # Places along a side of the sensor at which the surface is asked
 _AT_ONCE = 256
 
 
 def learned_sigma(
     cells: Cells,
     surface: CellSurface,
-    leaning: NDArray[np.bool_],
+    leaning: BoolArray,
     base: FringeTemplates,
     free: Nuisances,
     fit: NuisanceFit,
@@ -37,26 +33,8 @@ def learned_sigma(
 ) -> NDArray[np.float32]:
     """Standard uncertainty of the thickness of every pixel from all that was learned but the scale [µm].
 
-    Parameters
-    ----------
-    cells : `Cells`
-        Mean amplitudes.
-    surface : `CellSurface`
-        Thickness of the cells.
-    leaning : `numpy.ndarray`, bool, shape ``(ny, nx)``
-        Pixels that have the surface of the cells as their prior.
-    base : `FringeTemplates`
-        The model as it was before anything was learned.
-    free : `Nuisances`
-        What was free.
-    fit : `NuisanceFit`
-        What was learned.
-    order_um : `float`
-        Thickness of one fringe order [µm].
-
-    Returns
-    -------
-    sigma : `numpy.ndarray`, float32, shape ``(ny, nx)``
+    ``leaning``: pixels that have the surface of the cells as their prior, bool, ``(ny, nx)``; ``order_um``:
+    thickness of one fringe order [µm]. Returns float32, ``(ny, nx)``.
     """
     if fit.covariance.size == 0 or not surface.known.any():
         return np.zeros(leaning.shape, np.float32)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import FloatArray
 from .evidence import refine_row
 from .learning_cells import LearningCells
 from .misfit import Misfit, shared_variances
@@ -22,22 +23,16 @@ from .nuisances import OVERTONES, NuisanceFit, Nuisances, light_widths
 from .templates import FringeTemplates
 from .wavelengths import CommonError, common_error, shift_precision
 
-__all__ = ["learn", "moves_of"]
-
-FloatArray = NDArray[np.float64]
-
 _ROUNDS = 8
 _TOLERANCE = 3e-5
 _CONTRAST_BY_WAVELENGTH = 0.3
 """Standard deviation of the logarithm of the contrast of one wavelength about the mean of all."""
-_FADING = 0.1
-"""Standard deviation of the logarithmic loss of contrast per thickness [1/µm]."""
+_FADING = 0.1  # Standard deviation of the logarithmic loss of contrast per thickness [1/µm]
 _OVERTONE, _OVERTONE_BY_WAVELENGTH = 0.5, 0.2
 """Standard deviations of what is added of the overtones of the model: what wavelengths share, and what each has
 besides."""
 _TEMPLATE_MARGIN_UM = 0.5
-_FREE = 1e-4
-"""Precision of what has no prior."""
+_FREE = 1e-4  # Precision of what has no prior
 
 
 def learn(
@@ -50,26 +45,9 @@ def learn(
 ) -> tuple[NDArray[np.float32], NuisanceFit]:
     """Fit light, contrast, wavelengths and the thickness of the cells together, the orders being known.
 
-    Parameters
-    ----------
-    cells : `LearningCells`
-        Mean amplitudes, with their thickness to within a fraction of an order.
-    base : `FringeTemplates`
-        The model, normalised to the sensor.
-    free : `Nuisances`
-        What is free.
-    start : `NuisanceFit`
-        Where to begin.
-    rounds : `int`, optional
-        Most steps.
-    final : `bool`, optional
-        Keep the covariance of what was learned, which nobody asks of an order that is compared.
-
-    Returns
-    -------
-    thickness_um : `numpy.ndarray`, float32
-        Thickness of the cells looked at.
-    fit : `NuisanceFit`
+    ``cells``: mean amplitudes, with their thickness to within a fraction of an order; ``rounds``: most steps;
+    ``final``: keep the covariance of what was learned, which nobody asks of an order that is compared. Returns
+    ``thickness_um``: thickness of the cells looked at, float32.
     """
     problem = _Problem.of(cells, base, free)
     fit, thickness = replace(start, middle_um=float(np.median(cells.thickness_um))), cells.thickness_um
@@ -378,20 +356,10 @@ def moves_of(
 ) -> tuple[FloatArray, FloatArray]:
     """What a change of all that was learned does to the thickness of each cell.
 
-    Parameters
-    ----------
-    cells, base, free : `LearningCells`, `FringeTemplates`, `Nuisances`
-        As for `learn`.
-    fit : `NuisanceFit`
-        What was learned.
-
-    Returns
-    -------
-    moves : `numpy.ndarray`, shape ``(n, n_cells)``
-        Thickness per unit of each parameter [µm]: those of one wavelength after the other, then what all share.
-        Without the common error of the wavelengths.
-    information : `numpy.ndarray`, shape ``(n_cells,)``
-        Inverse variance of the thickness from the noise of the cell [1/µm²].
+    ``cells, base, free``: as for `learn`. Returns ``moves``: thickness per unit of each parameter [µm]: those of
+    one wavelength after the other, then what all share. Without the common error of the wavelengths,
+    ``(n, n_cells)``; ``information``: inverse variance of the thickness from the noise of the cell [1/µm²],
+    ``(n_cells,)``.
     """
     return _Problem.of(cells, base, free).moves(fit)
 

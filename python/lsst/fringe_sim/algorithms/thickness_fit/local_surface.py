@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.special import gammaincinv
 
+from ...array_types import BoolArray, FloatArray
 from ...compiled import kernel
 from .cells import Cells
 from .leaning import most_likely_shares, responsibility
@@ -25,74 +26,47 @@ from .pixels import LONE_CELL_PENALTY, SAME_SURFACE, CellSurface
 from .posterior import REACH
 from .templates import FringeTemplates
 
-__all__ = ["LocalSurface", "local_surface", "shares_of_middle"]
-
-FloatArray = NDArray[np.float64]
-
-_SIDE = np.arange(-2, 3)
-"""Cells about one that show its surface."""
-_FAR = 2
-"""Cells that are so many away have others between them and the one in the middle."""
+_SIDE = np.arange(-2, 3)  # Cells about one that show its surface
+_FAR = 2  # Cells that are so many away have others between them and the one in the middle
 _TAIL = 4.0
 """Degrees of freedom of Student's distribution of cells about a surface (Lange, Little & Taylor 1989, J. Am. Stat.
 Assoc. 84, 881)."""
-_TURNS = 12
-"""Steps by which a chain of cells on the wrong side of a crest comes back."""
+_TURNS = 12  # Steps by which a chain of cells on the wrong side of a crest comes back
 _ROUNDS = 3
-_LONGEST_STEP = 0.1
-"""Longest way, in orders, by which a cell asks to move a surface at once."""
+_LONGEST_STEP = 0.1  # Longest way, in orders, by which a cell asks to move a surface at once
 _AT_ONCE = 4096
-_FREEDOM = 25.0 - 6.0
-"""Cells of a window, less the terms of its surface."""
-_MEDIAN = 2.0 * float(gammaincinv(0.5 * _FREEDOM, 0.5))
-"""Median of the chi-square of a window."""
+_FREEDOM = 25.0 - 6.0  # Cells of a window, less the terms of its surface
+_MEDIAN = 2.0 * float(gammaincinv(0.5 * _FREEDOM, 0.5))  # Median of the chi-square of a window
 _FACTORS = np.concatenate([[1.0], 1.2 * np.geomspace(1.0, 100.0, 12)])
 """Factors on the variance of cells about their surface; a window tells a variance to a third."""
-_MOST_WINDOWS = 4096
-"""Windows that show how far surfaces do not fit."""
+_MOST_WINDOWS = 4096  # Windows that show how far surfaces do not fit
 
 
 @dataclass(frozen=True, eq=False)
 class LocalSurface:
-    """Surface about each cell.
+    """Surface about each cell."""
 
-    Attributes
-    ----------
-    terms : `numpy.ndarray`, float32, shape ``(ncy, ncx, 6)``
-        Of 1, y, x, y², xy, x², with y and x in pixels from the centre of the cell [µm].
-    sigma_um : `numpy.ndarray`, float32, shape ``(ncy, ncx)``
-        Standard uncertainty of the first [µm]: the noise of the cells, and what they leave over beyond that of most;
-        infinite where nobody asked.
-    holds : `numpy.ndarray`, bool, shape ``(ncy, ncx)``
-        Whether the cell and its eight neighbours lie on their surfaces, and more cells show it than it has terms.
-    """
-
+    # of 1, y, x, y², xy, x², with y and x in pixels from the centre of the cell [µm], float32, ``(ncy, ncx, 6)``
     terms: NDArray[np.float32]
+    # standard uncertainty of the first [µm]: the noise of the cells, and what they leave over beyond that of most;
+    # infinite where nobody asked, float32, ``(ncy, ncx)``
     sigma_um: NDArray[np.float32]
-    holds: NDArray[np.bool_]
+    # whether the cell and its eight neighbours lie on their surfaces, and more cells show it than it has terms,
+    # bool, ``(ncy, ncx)``
+    holds: BoolArray
 
 
 def local_surface(
     surface: CellSurface,
     cells: Cells,
     templates: FringeTemplates,
-    asked: NDArray[np.bool_],
+    asked: BoolArray,
     order_um: float,
 ) -> LocalSurface:
     """The most likely surfaces about the cells that are asked.
 
-    Parameters
-    ----------
-    surface : `CellSurface`
-        Cells as they were solved.
-    cells : `Cells`
-        Their mean amplitudes.
-    templates : `FringeTemplates`
-        The model, normalised to the sensor.
-    asked : `numpy.ndarray`, bool, shape ``(ncy, ncx)``
-        Cells whose surface is wanted.
-    order_um : `float`
-        Thickness of one fringe order [µm].
+    ``asked``: cells whose surface is wanted, bool, ``(ncy, ncx)``; ``order_um``: thickness of one fringe order
+    [µm].
     """
     terms, sigma = np.zeros((*asked.shape, 6), np.float32), np.full(asked.shape, np.inf, np.float32)
     found = LocalSurface(terms, sigma, np.zeros(asked.shape, bool))
@@ -126,7 +100,7 @@ def _fit(
     surface: CellSurface,
     seen: FloatArray,
     precision: FloatArray,
-    asked: NDArray[np.bool_],
+    asked: BoolArray,
     order_um: float,
     found: LocalSurface,
 ) -> FloatArray:
@@ -157,7 +131,7 @@ def _fit(
     return np.concatenate(misfit, axis=1)
 
 
-def _allow_for_misfit(found: LocalSurface, asked: NDArray[np.bool_], misfit: FloatArray) -> None:
+def _allow_for_misfit(found: LocalSurface, asked: BoolArray, misfit: FloatArray) -> None:
     """Make the uncertainty larger where a layer steps, in place: cells about a place leave over more than elsewhere.
 
     A place lies off its surface as the cells about it do, and the surface by what that makes of it.

@@ -14,37 +14,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import FloatArray
 from ...errors import InputError, OutOfRangeError, UnknownNameError
 from ..thickness_fit_options import CONTRASTS, ZONES
 from .cells import Cells
 from .templates import FringeTemplates
 
-__all__ = [
-    "CONTRASTS",
-    "GAIN_ACCURACY",
-    "LSST_GRID",
-    "ZONES",
-    "NuisanceFit",
-    "Nuisances",
-    "add_offset",
-    "light_patterns",
-    "light_widths",
-    "patterns_of_cells",
-    "subtract_offset",
-]
-
-FloatArray = NDArray[np.float64]
-
-_ROWS = 16
-"""Rows of cells whose light is made at a time."""
-OVERTONES = 4
-"""Numbers that describe the overtones at one wavelength."""
+_ROWS = 16  # Rows of cells whose light is made at a time
+OVERTONES = 4  # Numbers that describe the overtones at one wavelength
 GAIN_ACCURACY = 0.005
 """How well gains of amplifiers are known: a few 1e-3 from iron-55, or from the variance of pairs of flats."""
-LSST_GRID = (2, 8)
-"""Rows and columns of the amplifiers of an LSST sensor."""
-LEAST_ZONE_PX = 16
-"""Pixels along a side of an amplifier below which its level is not told from its fringes."""
+LSST_GRID = (2, 8)  # Rows and columns of the amplifiers of an LSST sensor
+LEAST_ZONE_PX = 16  # Pixels along a side of an amplifier below which its level is not told from its fringes
 _GAIN_BY_WAVELENGTH = 0.2
 """Standard deviation of the level of a zone at one wavelength, over that of its mean: levels are mostly gains."""
 _LIGHT, _LIGHT_BY_WAVELENGTH = 0.1, 0.02
@@ -149,50 +130,33 @@ def _borders(size: int, count: int) -> tuple[int, ...]:
 
 @dataclass(frozen=True, eq=False)
 class NuisanceFit:
-    """Light, contrast and wavelengths that a fit found.
+    """Light, contrast and wavelengths that a fit found."""
 
-    Attributes
-    ----------
-    coefficients : `numpy.ndarray`, shape ``(n_wavelengths, n_patterns)``
-        Logarithm of the light on the patterns of `light_patterns`.
-    contrast, contrast_sigma : `numpy.ndarray`, shape ``(n_wavelengths,)``
-        Factor on the fringe amplitude at the middle thickness of the sensor, and its standard uncertainty.
-    shift_nm, shift_sigma_nm : `numpy.ndarray`, shape ``(n_wavelengths,)``
-        Wavelength of each flat minus that of its label [nm].
-    fading : `float`
-        Logarithmic loss of contrast per thickness [1/µm].
-    overtones : `numpy.ndarray`, shape ``(n_wavelengths, 4)``
-        What is added of the overtones of the model, as factors on `FringeTemplates.overtones`.
-    middle_um : `float`
-        Thickness at which ``contrast`` holds [µm].
-    scale_sigma : `float`
-        Standard uncertainty of the scale of the thickness, which all pixels share.
-    misfit : `numpy.ndarray`, shape ``(n_wavelengths,)``
-        Typical squared residual of the cells over their variance, at each wavelength.
-    mean_response : `numpy.ndarray`, shape ``(n_wavelengths,)``
-        Mean response over the sensor to which level and contrast belong; empty if it is not known.
-    chi2, prior : `float`
-        Twice the negative logarithm of the probability of the cells looked at, and of the prior of the nuisances.
-    covariance : `numpy.ndarray`, shape ``(n, n)``
-        Of all that was learned, in the order of `learning.moves_of`; empty if nobody asked.
-    shared : `float`
-        Variance of sums over cells relative to that of cells which err each by itself.
-    """
-
+    # logarithm of the light on the patterns of `light_patterns`, ``(n_wavelengths, n_patterns)``
     coefficients: FloatArray
+    # contrast, contrast_sigma: factor on the fringe amplitude at the middle thickness of the sensor, and its
+    # standard uncertainty, ``(n_wavelengths,)``
     contrast: FloatArray
     contrast_sigma: FloatArray
+    # shift_nm, shift_sigma_nm: wavelength of each flat minus that of its label [nm], ``(n_wavelengths,)``
     shift_nm: FloatArray
     shift_sigma_nm: FloatArray
-    fading: float = 0.0
+    fading: float = 0.0  # logarithmic loss of contrast per thickness [1/µm]
+    # what is added of the overtones of the model, as factors on `FringeTemplates.overtones`, ``(n_wavelengths, 4)``
     overtones: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
-    middle_um: float = 0.0
-    scale_sigma: float = 0.0
+    middle_um: float = 0.0  # thickness at which ``contrast`` holds [µm]
+    scale_sigma: float = 0.0  # standard uncertainty of the scale of the thickness, which all pixels share
+    # typical squared residual of the cells over their variance, at each wavelength, ``(n_wavelengths,)``
     misfit: FloatArray = field(default_factory=lambda: np.ones(0))
+    # mean response over the sensor to which level and contrast belong; empty if it is not known,
+    # ``(n_wavelengths,)``
     mean_response: FloatArray = field(default_factory=lambda: np.empty(0))
+    # chi2, prior: twice the negative logarithm of the probability of the cells looked at, and of the prior of the
+    # nuisances
     chi2: float = np.inf
     prior: float = 0.0
-    shared: float = 1.0
+    shared: float = 1.0  # variance of sums over cells relative to that of cells which err each by itself
+    # of all that was learned, in the order of `learning.moves_of`; empty if nobody asked, ``(n, n)``
     covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
 
     @classmethod

@@ -26,8 +26,6 @@ from .pixels import CellSurface
 from .shared_misfit import cells_leave_only_noise, leaves_only_noise
 from .templates import FringeTemplates
 
-__all__ = ["Solver", "State", "surface_of"]
-
 _MODEL_CHANGE = 0.15  # Change of the model, in rms fringe amplitudes, at which the orders are solved again
 _MOST_SOLUTIONS = 3
 _MOST_COMPARED = 20_000  # Cells that show how far cells err alike

@@ -6,17 +6,13 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....array_types import FloatArray
 from ...inference import Columns, Hypothesis, Point, effect_columns, joined
 from ..accuracy import ACCURACY_SOURCE, MODEL_ACCURACY, TABLE_STEP_NM
 from ..learned_columns import over_wavelength
 from .critics import CRITICS, judge, total_chance
 from .rules import Rules
-
-__all__ = ["evidence_within", "model_block", "told_accuracy"]
-
-FloatArray = NDArray[np.float64]
 
 
 def told_accuracy(

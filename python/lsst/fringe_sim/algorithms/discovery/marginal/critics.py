@@ -8,8 +8,8 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....array_types import FloatArray
 from ....effects import ImageGeometry
 from ...inference import Columns, Hypothesis, Point, effect_columns, joined
 from ..channels import (
@@ -29,21 +29,7 @@ from ..spots import SpotScores
 from ..trends import FEWEST_DRAWS, trend_channel
 from .rules import Rules
 
-__all__ = [
-    "CRITICS",
-    "Judged",
-    "is_out_of_reach",
-    "judge",
-    "spot_scores",
-    "spots_instead",
-    "state_of",
-    "total_chance",
-]
-
-FloatArray = NDArray[np.float64]
-
-RANK = 1e-7
-"""Relative eigenvalue of what nothing else has left."""
+RANK = 1e-7  # Relative eigenvalue of what nothing else has left
 
 FEWEST_ROWS = {"phase": 1, "place": 8, "texture": BANDS * 3}
 """Rows and columns of cells from which on a critic says something."""

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....array_types import BoolArray, FloatArray
 from ....errors import OutOfRangeError
 from ...inference import CellShape, Data, Hypothesis, Point, fit, relaxed
 from ..learning import SIZES, Prior
@@ -24,18 +24,11 @@ from .lesson import (
 )
 from .preparation import Prepared
 
-__all__ = ["StandIn", "Unseen", "judge_unseen", "rms_unseen", "stand_in"]
-
-FloatArray = NDArray[np.float64]
-
 ROUNDS = 3
 """How often a stand-in is fitted again about itself, as long as that helps: what it does is hardly linear."""
 
-FAINT = 1e-9
-"""Weight of wavelengths that are left out: a level is all that follows them."""
-
-STRIDES = (1.0, 0.3, 0.1)
-"""Parts of the way to a fit that are tried."""
+FAINT = 1e-9  # Weight of wavelengths that are left out: a level is all that follows them
+STRIDES = (1.0, 0.3, 0.1)  # Parts of the way to a fit that are tried
 
 
 @dataclass(frozen=True)
@@ -138,7 +131,7 @@ def _gain_of_waves(prepared: Prepared, found: Hypothesis) -> float:
     return before - after
 
 
-def _cost_of_waves(found: Hypothesis, out: NDArray[np.bool_]) -> float:
+def _cost_of_waves(found: Hypothesis, out: BoolArray) -> float:
     """Minus the log likelihood of some wavelengths ``(W, 1)``, predicted by a fit to the others."""
     problem, data = found.point.problem, found.point.problem.data
     seen = replace(problem, data=Data(data.value, np.where(out, FAINT, 1.0) * data.weight))

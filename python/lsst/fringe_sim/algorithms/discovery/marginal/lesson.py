@@ -7,9 +7,9 @@ from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from ....array_types import BoolArray, FloatArray
 from ....effects import ImageGeometry
 from ...inference import CellShape, Data, Hypothesis, Point, Problem, fit, in_best_orders, relaxed
 from ..cells import CellData
@@ -21,20 +21,6 @@ from ..learning import Part, judging_cells
 from ..outliers import spoiled_cells
 from .noise import neighbour_scatter
 from .preparation import Prepared
-
-__all__ = [
-    "CellLesson",
-    "CellPart",
-    "data_of",
-    "in_all_cells",
-    "in_own_cells",
-    "together",
-    "unseen_too",
-    "with_corrections",
-]
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 def with_corrections(point: Point) -> Point:

@@ -15,8 +15,6 @@ from ..verdict import NamedEffect, ParameterValue, probability_text
 from .critics import spots_instead
 from .search import SetSearch
 
-__all__ = ["EffectClass", "Naming", "name_effects"]
-
 
 @dataclass(frozen=True, eq=False)
 class EffectClass:

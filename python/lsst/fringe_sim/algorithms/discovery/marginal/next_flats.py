@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ....array_types import FloatArray
 from ....errors import InputError
 from ....model import FringeModel
 from ...inference import Data, Forward, Hypothesis, Point
@@ -26,15 +27,8 @@ from ...next_measurement import (
 from ..cells import CellData
 from ..next_frames import pair_of
 
-__all__ = ["FlatForecast"]
-
-FloatArray = NDArray[np.float64]
-
-MOST_CELLS = 4096
-"""Cells for which a forecast is made; of more, so many stand for all."""
-
-MARGIN_UM = 0.1
-"""Thickness beyond that of the cells which tables of further flats cover [µm]."""
+MOST_CELLS = 4096  # Cells for which a forecast is made; of more, so many stand for all
+MARGIN_UM = 0.1  # Thickness beyond that of the cells which tables of further flats cover [µm]
 
 
 @dataclass(frozen=True, eq=False)

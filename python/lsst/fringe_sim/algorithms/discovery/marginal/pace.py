@@ -6,8 +6,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["Pace"]
-
 
 class Pace:
     """Times the fits of a search; ``left`` is how many the present round wants at most."""

@@ -9,11 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ....array_types import FloatArray
 from ...inference import Columns, Coordinate, Point
-
-__all__ = ["FEW", "Joint", "Promised", "ScoredPair"]
-
-FloatArray = NDArray[np.float64]
 
 FEW = 2
 """Parameters of an effect up to which it is scored with another one: more of them explain what many others do."""

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....array_types import BoolArray, FloatArray
 from ....effects import Effect
 from ....model import FringeModel
 from ....products.fringe_cube import FringeCube
@@ -31,22 +31,12 @@ from ..validation import BLOCKS_ACROSS, FEWEST_ROWS
 from .noise import measured_noise, neighbour_scatter
 from .rules import Rules
 
-__all__ = ["Prepared", "prepare", "prepare_again"]
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-
 MARGIN_UM = 0.8
 """Thickness beyond the first one that tables cover [µm]: effects may move it by some fringe orders."""
 
-FIRST_ERROR_UM = 0.004
-"""Error of the first thickness [µm]: it is one of steps of 0.01."""
-
-SURFACE_CELLS = 8.0
-"""Distance of the knots of the surface whose slope limits the size of cells [cells]."""
-
-KNOWN_UM = 1e-6
-"""Error of a thickness that is known [µm]."""
+FIRST_ERROR_UM = 0.004  # Error of the first thickness [µm]: it is one of steps of 0.01
+SURFACE_CELLS = 8.0  # Distance of the knots of the surface whose slope limits the size of cells [cells]
+KNOWN_UM = 1e-6  # Error of a thickness that is known [µm]
 
 NO_SCATTER, FIRST_SCATTER = 1e-6, 0.003
 """Response scatter that is none, and what it is before it is measured (the prototype's)."""

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....array_types import BoolArray, FloatArray
 from ....effects import Effect, Residuals
 from ....errors import OutOfRangeError
 from ...inference import Columns, Coordinate, Hypothesis, Point, effect_columns, in_best_orders, jumped
@@ -16,16 +16,11 @@ from ...inference.coordinates import SECANT
 from .pairs import FEW, Joint, Promised
 from .smooth import beside_smooth
 
-__all__ = ["Scored", "Scorer", "best_gain", "proposed", "residuals_of"]
-
-FloatArray = NDArray[np.float64]
-
 WIDTHS = np.geomspace(0.03, 30.0, 13)
 """Widths of the prior, in its scales, over which a score is the best: departures may be of any size."""
 
 
-FIRST_ROUNDS = 2
-"""Steps of the thickness after which places that an effect proposes are compared."""
+FIRST_ROUNDS = 2  # Steps of the thickness after which places that an effect proposes are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +144,7 @@ def _begun(effect: Effect, items: tuple[Coordinate, ...], values: dict[str, floa
     return in_best_orders(start, _covered(effect, items, start), rounds=FIRST_ROUNDS)
 
 
-def _covered(effect: Effect, items: tuple[Coordinate, ...], point: Point) -> NDArray[np.bool_]:
+def _covered(effect: Effect, items: tuple[Coordinate, ...], point: Point) -> BoolArray:
     """Cells in which a local effect is."""
     values = {item.parameter: point.settings[item.key] for item in items}
     return np.asarray(effect.coverage(values, point.problem.forward.geometry).ravel() > 0.0)

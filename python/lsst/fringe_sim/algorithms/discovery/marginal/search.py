@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....array_types import FloatArray
 from ....effects import Effect
 from ....effects.base import numbered
 from ....errors import InputError, OutOfRangeError
@@ -29,10 +29,6 @@ from .pace import Pace
 from .pairs import Joint
 from .rules import Rules
 from .scores import Scored, Scorer, best_gain, proposed
-
-__all__ = ["Catalogue", "SetSearch"]
-
-FloatArray = NDArray[np.float64]
 
 PARTS = 1.0, 0.3
 """Parts of a linear step of several parameters from which they are fitted: the whole may lead too far."""

@@ -6,25 +6,20 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize_scalar
 from scipy.sparse.linalg import splu
 
+from ....array_types import FloatArray
 from ...inference import Point, Problem
 from ..continuation import curvature_of
-
-__all__ = ["beside_smooth"]
-
-FloatArray = NDArray[np.float64]
 
 STIFFEST = 12.0
 """Largest logarithm of the stiffness of a smooth thickness over the curvature of the likelihood of a cell, on both
 sides of 1: beyond, it is a plane or takes up all."""
 
-TOLERANCE = 0.5
-"""The same to which the stiffness is known: nothing depends on a factor of less."""
+TOLERANCE = 0.5  # The same to which the stiffness is known: nothing depends on a factor of less
 
 PLANE, NO_WEIGHT = 3, 1e-12
 """Parameters of a plane, which costs no bending, and weight of cells that are not known."""

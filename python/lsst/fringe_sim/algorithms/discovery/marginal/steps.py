@@ -8,8 +8,6 @@ from .rules import Rules
 from .scores import residuals_of
 from .search import SetSearch
 
-__all__ = ["told_of_steps"]
-
 
 def told_of_steps(sets: SetSearch, found: Hypothesis, rules: Rules) -> list[str]:
     """Sentences for a verdict on local effects beside which the thickness of a set steps no more.

@@ -12,8 +12,6 @@ from ..validation import size_beyond
 from ..verdict import Step
 from .preparation import Prepared
 
-__all__ = ["data_of", "rms_left", "size_of", "steps_of"]
-
 
 def rms_left(prepared: Prepared, found: Hypothesis) -> float:
     """Rms of data minus model of the part searched, corrected for the freedom of all that is fitted."""

@@ -8,7 +8,6 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ....effects import Effect
 from ....model import FringeModel
@@ -36,10 +35,6 @@ from .rules import Rules
 from .search import Catalogue, SetSearch
 from .steps import told_of_steps
 from .telling import data_of, rms_left, size_of, steps_of
-
-__all__ = ["MarginalSearch"]
-
-FloatArray = NDArray[np.float64]
 
 
 class MarginalSearch:
