@@ -166,8 +166,6 @@ def test_a_fit_has_its_flats_in_the_order_of_their_wavelengths() -> None:
     inputs: dict[str, Any] = {"flats": ("connection", offered)}
     changed, _ = connections.adjustQuantum(inputs, {}, "fit", None)
     assert changed == inputs == {"flats": ("connection", [offered[number] for number in (2, 3, 1, 0)])}
-    with pytest.raises(base.NoWorkFound):
-        connections.adjustQuantum({"flats": (connections.flats, [])}, {}, "fit", None)
 
 
 @pytest.mark.parametrize("both", [True, False])
