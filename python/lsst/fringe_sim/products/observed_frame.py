@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .fits_product import DETECTOR, FILTER, MASK, Card, Image, SensorProduct
+from .sky_frame import SkyFringe
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -52,4 +53,19 @@ class ObservedFrame(SensorProduct):
         Image("image", "IMAGE", None, gaps=True),
         MASK,
         Image("variance", "VARIANCE", None, gaps=True, optional=True),
+    )
+
+
+def observed_from_simulation(frame: SkyFringe) -> ObservedFrame:
+    """A simulated frame of the sky, as if it had been observed."""
+    electrons = frame.image
+    if frame.unit == "fraction":
+        electrons = (frame.mean_electrons * (1.0 + frame.image)).astype(np.float32)
+    return ObservedFrame(
+        image=electrons,
+        mask=frame.mask,
+        unit="electron",
+        metadata=frame.metadata,
+        detector=frame.detector,
+        physical_filter=frame.physical_filter,
     )

@@ -161,7 +161,8 @@ def shares_of_middle(
     """Rows and columns of the cells about some, and the share of each in the surface of the one in the middle."""
     b, a, known, design, _ = _window(surface, precision, y, x)
     turned = (design * known[..., None]).swapaxes(1, 2)
-    share = np.linalg.solve(turned @ design + _prior(order_um), turned)[:, 0]
+    # Fewer cells than terms, each known exactly, are a singular matrix.
+    share = (np.linalg.pinv(turned @ design + _prior(order_um), hermitian=True) @ turned)[:, 0]
     return b, a, np.asarray(share, float)
 
 
