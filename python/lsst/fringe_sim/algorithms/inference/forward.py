@@ -124,7 +124,8 @@ class Forward:
         if blur_px or not covered:
             return [self.shape.nodes(blur_px)] * (1 + len(covered))
         even = np.array([0.0, 0.0, 1.0, 0.0, 1.0])[:, np.newaxis] / 12.0
-        rest = 1.0 - sum(part for part, _ in covered), even - sum(moments for _, moments in covered)
+        parts, moments = zip(*covered, strict=True)
+        rest = 1.0 - np.sum(parts, axis=0), even - np.sum(moments, axis=0)
         return [self.shape.nodes_of_part(*each) for each in (rest, *covered)]
 
     def _looked_up(
