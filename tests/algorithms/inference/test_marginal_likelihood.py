@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter
 
 from lsst.fringe_sim.algorithms.inference import (
@@ -166,6 +167,34 @@ def test_averages_in_cells_are_those_of_pixels(cell_px: int) -> None:
     level = (value * exact).sum(axis=1, keepdims=True) / (exact**2).sum(axis=1, keepdims=True)
     wrong = (value / level - exact) / exact.std(axis=1, keepdims=True)
     assert wrong.std() < 1e-4
+
+
+@pytest.mark.parametrize(("gap_nm", "most"), [(12.0, 2e-3), (120.0, 8e-3)])
+def test_cells_under_the_rim_of_an_island_are_those_of_pixels(gap_nm: float, most: float) -> None:
+    # Each stack is seen at the thickness of its own part of the cell; at that of the whole cell both err by 0.02
+    # and 0.14.
+    forward, thickness = forward_of(1, 24)
+    settings = {"void.thickness": gap_nm, "void.centre_x": 11.3, "void.centre_y": 12.1, "void.radius": 5.6}
+    value = forward.predict(settings, thickness)[0]
+    parts = 40
+    place = (np.arange(24 * parts) + 0.5) / parts - 0.5
+    y, x = np.meshgrid(place, place, indexing="ij")
+    inside = np.hypot(y - 12.1, x - 11.3) < 5.6
+    ((_, void),) = forward.model.with_effects(settings, EFFECTS).islands
+    exact = []
+    for model in (forward.model, void):
+        table = np.linspace(*forward.range_um, 1500)
+        light = model.system.flat_fields(WAVELENGTHS, 0.1)
+        response = model.respond(light, table, WAVELENGTHS)
+        exact.append(np.stack([CubicSpline(table, own)(field(y, x)) for own in response]))
+    mixed = np.where(inside, exact[1], exact[0])
+    mixed = mixed.reshape(len(WAVELENGTHS), 24, parts, 24, parts).mean(axis=(2, 4)).reshape(value.shape)
+    share = inside.reshape(24, parts, 24, parts).mean(axis=(1, 3)).ravel()
+    rim = (share > 0.0) & (share < 1.0)
+    level = (value * mixed)[:, ~rim].sum(axis=1) / (mixed**2)[:, ~rim].sum(axis=1)
+    wrong = (value / level[:, np.newaxis] - mixed) / mixed.std(axis=1, keepdims=True)
+    assert wrong[:, ~rim].std() < 5e-4
+    assert wrong[:, rim].std() < most
 
 
 def test_a_blur_over_some_pixels_is_that_of_pixels() -> None:

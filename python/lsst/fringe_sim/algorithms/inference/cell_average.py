@@ -19,6 +19,9 @@ LEAST_SPREAD_UM2 = 1e-14  # Variance of the thickness in a cell that is rounding
 STIFFNESSES, BISECTIONS = (1e-4, 1e10), 30
 """Least and largest weight of third differences, and how often the range is halved."""
 
+LEAST_PART = 1e-6  # Part of a cell that is none
+UNIFORM = 1.8  # Fourth moment of an even distribution over its squared variance
+
 BLURRED_PLACES = 7  # Places that stand for a blur: a Gaussian of 2 rad rms of fringe phase is right to 1e-3
 
 MOST_BENT = 0.4, 0.06
@@ -89,20 +92,32 @@ class CellShape:
 
     @cached_property
     def _unblurred(self) -> tuple[FloatArray, FloatArray]:
-        shift, second, third, fourth = self._moments(0.0)
-        some = second > LEAST_SPREAD_UM2
-        safe = np.where(some, second, 1.0)
-        skew = np.where(some, third / safe, 0.0)
-        tail = np.where(some, fourth / safe, 0.0)
-        skew = np.clip(skew, -np.sqrt(0.25 * tail), np.sqrt(0.25 * tail))
-        product = tail - skew**2  # of the two distances on both sides
-        width = np.sqrt(skew**2 + 4.0 * product)
-        upper, lower = 0.5 * (width + skew), 0.5 * (width - skew)
-        shares = [
-            np.divide(second, width * side, out=np.zeros_like(width), where=some) for side in (upper, lower)
-        ]
-        places = np.stack([np.zeros_like(width), upper, -lower]) + shift
-        return places, np.stack([1.0 - shares[0] - shares[1], *shares])
+        return _three_places(*self._moments(0.0))
+
+    def nodes_of_part(self, part: FloatArray, moments: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The same as `nodes` of a part of every cell, such as the one that lies on an island.
+
+        ``part`` (N,): share of the area. ``moments`` (5, N): means over the cell of y, x, y², yx and x² where the
+        part is and of 0 elsewhere, from the middle of the cell and in units of its side. A cell that is all or none
+        of the part has the places of the whole.
+        """
+        places, shares = self._unblurred
+        crossed = np.flatnonzero((part > LEAST_PART) & (part < 1.0 - LEAST_PART))
+        if not crossed.size or not self.area:
+            return places, shares
+        y, x, *square = moments[:, crossed] / part[crossed] * self.cell_px
+        yy, yx, xx = (self.cell_px * each for each in square)
+        down, along = self.gradient[:, crossed]
+        bent = self.hessian[:, crossed]
+        mean = down * y + along * x
+        second = down**2 * yy + 2.0 * down * along * yx + along**2 * xx - mean**2
+        second = np.maximum(second, 0.0)
+        mean = mean + 0.5 * (bent[0] * yy + 2.0 * bent[1] * yx + bent[2] * xx)
+        places, shares = places.copy(), shares.copy()
+        places[:, crossed], shares[:, crossed] = _three_places(
+            mean, second, np.zeros_like(mean), UNIFORM * second**2
+        )
+        return places, shares
 
     def _moments(self, blur_px: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Mean, and second to fourth moment of the thickness about that, from the place in the middle."""
@@ -130,6 +145,25 @@ class CellShape:
         reach = np.abs(self.edge_px) / blur_px
         mean = math.sqrt(2.0 / math.pi) * np.exp(-0.5 * reach**2) + reach * erf(reach / math.sqrt(2.0))
         return blur_px * np.sign(self.edge_px) * (mean - reach), blur_px**2 * (reach**2 + 1.0 - mean**2)
+
+
+def _three_places(
+    shift: FloatArray, second: FloatArray, third: FloatArray, fourth: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Three places and their weights, ``(3, N)``, with a mean and moments about that."""
+    some = second > LEAST_SPREAD_UM2
+    safe = np.where(some, second, 1.0)
+    skew = np.where(some, third / safe, 0.0)
+    tail = np.where(some, fourth / safe, 0.0)
+    skew = np.clip(skew, -np.sqrt(0.25 * tail), np.sqrt(0.25 * tail))
+    product = tail - skew**2  # of the two distances on both sides
+    width = np.sqrt(skew**2 + 4.0 * product)
+    upper, lower = 0.5 * (width + skew), 0.5 * (width - skew)
+    shares = [
+        np.divide(second, width * side, out=np.zeros_like(width), where=some) for side in (upper, lower)
+    ]
+    places = np.stack([np.zeros_like(width), upper, -lower]) + shift
+    return places, np.stack([1.0 - shares[0] - shares[1], *shares])
 
 
 def _smoothed(field: FloatArray, error: float) -> FloatArray:

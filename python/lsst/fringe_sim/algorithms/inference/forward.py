@@ -11,7 +11,7 @@ import numpy as np
 
 from ...array_types import FloatArray
 from ...effects import Effect, ImageGeometry, activate_effects, apply_to_image
-from ...effects.active import another
+from ...effects.active import ActiveEffect, another
 from ...model import FringeModel
 from ...optics.illumination import Illumination
 from ..discovery.evaluations import note_evaluation
@@ -96,22 +96,37 @@ class Forward:
         self, optical: Settings, thickness_um: FloatArray, blur_px: float
     ) -> tuple[FloatArray, FloatArray]:
         """The same before effects on the image."""
-        nodes = self.shape.nodes(blur_px)
         everywhere = {key: value for key, value in optical.items() if not self.effect_of(key).local}
-        value, slope = self._looked_up(self.table(everywhere), thickness_um, nodes)
-        if len(everywhere) < len(optical):
-            for item, model in self._model(optical).islands:
-                part = item.coverage(self.model.base_system, self.geometry).ravel()
-                own = {f"{item.effect.name}.{name}": x for name, x in item.values.items()}
-                places = {f"{item.effect.name}.{name}" for name in item.effect.search.places}
-                key = tuple(
-                    sorted({**everywhere, **{k: v for k, v in own.items() if k not in places}}.items())
-                )
-                inside = self._looked_up(self._island_table(key, everywhere, model), thickness_um, nodes)
-                value, slope = (
-                    all_ + part * (here - all_) for all_, here in zip((value, slope), inside, strict=True)
-                )
+        islands = self._model(optical).islands if len(everywhere) < len(optical) else ()
+        covered = [self._covered(item) for item, _ in islands]
+        outside, *on = self._nodes_of_parts(covered, blur_px)
+        value, slope = self._looked_up(self.table(everywhere), thickness_um, outside)
+        for (item, model), (part, _), nodes in zip(islands, covered, on, strict=True):
+            own = {f"{item.effect.name}.{name}": x for name, x in item.values.items()}
+            places = {f"{item.effect.name}.{name}" for name in item.effect.search.places}
+            key = tuple(sorted({**everywhere, **{k: v for k, v in own.items() if k not in places}}.items()))
+            inside = self._looked_up(self._island_table(key, everywhere, model), thickness_um, nodes)
+            value, slope = (
+                all_ + part * (here - all_) for all_, here in zip((value, slope), inside, strict=True)
+            )
         return value, slope
+
+    def _covered(self, item: ActiveEffect) -> tuple[FloatArray, FloatArray]:
+        """Part of every cell on an island, ``(N,)``, and its moments, ``(5, N)``."""
+        part = item.coverage(self.model.base_system, self.geometry).ravel()
+        moments = item.coverage_moments(self.model.base_system, self.geometry)
+        return part, moments.reshape(len(moments), -1)
+
+    def _nodes_of_parts(
+        self, covered: Sequence[tuple[FloatArray, FloatArray]], blur_px: float
+    ) -> list[tuple[FloatArray, FloatArray]]:
+        """Places in thickness outside all islands, and of each; a blur mixes both sides of a rim."""
+        if blur_px or not covered:
+            return [self.shape.nodes(blur_px)] * (1 + len(covered))
+        even = np.array([0.0, 0.0, 1.0, 0.0, 1.0])[:, np.newaxis] / 12.0
+        parts, moments = zip(*covered, strict=True)
+        rest = 1.0 - np.sum(parts, axis=0), even - np.sum(moments, axis=0)
+        return [self.shape.nodes_of_part(*each) for each in (rest, *covered)]
 
     def _looked_up(
         self, table: FloatArray, thickness_um: FloatArray, nodes: tuple[FloatArray, ...]
