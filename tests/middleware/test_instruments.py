@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import lsst.pex.config as pex_config
@@ -5,6 +6,7 @@ import pytest
 from lsst.daf.butler import Butler
 from lsst.pipe.base import Instrument
 from lsst.resources import ResourcePath
+from lsst.utils import doImport
 from toy_repository import Invoke
 
 import lsst.fringe_sim
@@ -123,3 +125,12 @@ def test_repository_from_the_seed_configuration(tmp_path: Path, invoke: Invoke) 
 def test_no_pickle_anywhere_in_the_configuration() -> None:
     for name in ("butler.yaml", "storageClasses.yaml", "datastores/formatters.yaml"):
         assert b"pickle" not in ResourcePath(f"resource://lsst.fringe_sim/configs/{name}").read().lower()
+
+
+@pytest.mark.parametrize("name", ["storageClasses.yaml", "datastores/formatters.yaml"])
+def test_every_name_of_the_package_in_the_configuration_leads_somewhere(name: str) -> None:
+    text = ResourcePath(f"resource://lsst.fringe_sim/configs/{name}").read().decode()
+    names = re.findall(r"lsst\.fringe_sim(?:\.\w+)+", text)
+    assert names
+    for each in names:
+        assert callable(doImport(each)), each
