@@ -21,6 +21,7 @@ from lsst.fringe_sim.algorithms.observed_frames import FrameRecord
 from lsst.fringe_sim.algorithms.sky_shift import SkyShift
 from lsst.fringe_sim.challenge.page import write_challenge_report
 from lsst.fringe_sim.challenge.result import CaseResult, ChallengeResult
+from lsst.fringe_sim.instrument.setup import Setup
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.paper.published import published_numbers
 from lsst.fringe_sim.paper.reproduce import Reproduction
@@ -137,7 +138,7 @@ SMALL_PAGES: dict[str, Callable[[Path, Origin], Path]] = {
     "sky": lambda folder, origin: write_sky_report(
         folder / "report.html",
         [sky((64, 64), number, mask=np.zeros((64, 64), np.int32)) for number in (1, 2)],
-        "lsst_e2v",
+        Setup.from_name("lsst_e2v"),
         1,
         picture=folder / "sky.png",
         origin=origin,

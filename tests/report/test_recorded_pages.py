@@ -25,6 +25,7 @@ from lsst.fringe_sim.algorithms.map_on_sky import MapOnSky
 from lsst.fringe_sim.algorithms.public_evidence.verdict import KindRow
 from lsst.fringe_sim.algorithms.sky_shift import SkyShift
 from lsst.fringe_sim.instrument.camera import Camera
+from lsst.fringe_sim.instrument.setup import Setup
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.paper.published import published_numbers
 from lsst.fringe_sim.paper.reproduce import Reproduction
@@ -97,9 +98,8 @@ def sky_page(folder: Path) -> Path:
         frames.append(
             SkyFringe(image.astype(np.float32), mask, "electron", level, 30.0, 1.2, hour, None, 1e-8)
         )
-    return write_sky_report(
-        folder / "sky.html", frames, "lsst_e2v", 1, picture=folder / "sky.png", pixel_arcsec=0.5
-    )
+    setup = replace(Setup.from_name("lsst_e2v"), pixel_scale_arcsec=0.5)
+    return write_sky_report(folder / "sky.html", frames, setup, 1, picture=folder / "sky.png")
 
 
 def correction_page(folder: Path) -> Path:

@@ -7,10 +7,13 @@ import pytest
 from browser import check_page
 
 from lsst.fringe_sim.algorithms.fringe_amplitudes import fringe_amplitudes
+from lsst.fringe_sim.instrument.setup import Setup
 from lsst.fringe_sim.products import SkyFringe
 from lsst.fringe_sim.report.figures import residuals_figure
 from lsst.fringe_sim.report.sky_page import sky_amplitudes, write_sky_report
 from lsst.fringe_sim.style import block_mean
+
+LSST = Setup.from_name("lsst_e2v")
 
 
 def night(shape: tuple[int, int] = (150, 160), hours: int = 3) -> list[SkyFringe]:
@@ -42,11 +45,11 @@ def test_amplitudes_are_those_of_the_frames() -> None:
 
 def test_page_of_a_night_in_a_browser(tmp_path) -> None:
     """With components and coadds; a single frame with noise has neither."""
-    path = write_sky_report(tmp_path / "night.html", night(), "lsst_e2v", 1)
+    path = write_sky_report(tmp_path / "night.html", night(), LSST, 1)
     text = path.read_text(encoding="utf-8")
     for words in ("Components", "Coadds", "coadds.ecsv", "sky_fringe_amplitudes.ecsv"):
         assert words in text
-    alone = write_sky_report(tmp_path / "one.html", night(hours=1), "lsst_e2v", 1).read_text(encoding="utf-8")
+    alone = write_sky_report(tmp_path / "one.html", night(hours=1), LSST, 1).read_text(encoding="utf-8")
     assert "Components" not in alone
     assert "Coadds" in alone
     check_page(path, tmp_path, 390, "sky_390")
@@ -84,6 +87,6 @@ def test_residuals_are_on_the_scale_of_the_noise_of_their_means(rng) -> None:
 def test_what_a_table_with_noise_shows_is_said(tmp_path) -> None:
     """The summary has the fringes alone."""
     quiet, said = night(hours=1), "noise included"
-    assert said not in write_sky_report(tmp_path / "a.html", quiet, "lsst_e2v", 1).read_text("utf-8")
+    assert said not in write_sky_report(tmp_path / "a.html", quiet, LSST, 1).read_text("utf-8")
     noisy = [replace(frame, seed=1, metadata={"FRINGRMS": 0.002, "FRING198": 0.003}) for frame in quiet]
-    assert said in write_sky_report(tmp_path / "b.html", noisy, "lsst_e2v", 1).read_text("utf-8")
+    assert said in write_sky_report(tmp_path / "b.html", noisy, LSST, 1).read_text("utf-8")

@@ -142,9 +142,10 @@ def sky(
     made = _written(series, scales, folder / f"sky_{sensor.name}", cards, section)
     if templates:
         _write_templates(layers, model, response, folder / f"fringe_{sensor.name}", cards, sensor)
-    shown: dict[str, Any] = {"picture": folder / "sky.png", "pixel_arcsec": setup.pixel_scale_arcsec}
-    shown |= {"section": section, "origin": origin_of(folder, given)}
-    page = write_sky_report(folder / "report.html", made, setup.name, seed, places, **shown)
+    shown: dict[str, Any] = {"section": section, "origin": origin_of(folder, given)}
+    page = write_sky_report(
+        folder / "report.html", made, setup, seed, places, picture=folder / "sky.png", **shown
+    )
     for line in (*_said(made, model, contrast), folder, page):
         click.echo(str(line))
 

@@ -15,6 +15,7 @@ from ..algorithms.coadd_sources import sources_in_coadds
 from ..algorithms.coadds import Coadds, VisitPlaces, coadds_of_frames
 from ..algorithms.pca import fit_pca
 from ..files import table_text, write_whole
+from ..instrument.setup import Setup
 from ..products import SensorSection, SkyFringe
 from .figures import coadds_figure, components_figure, sky_figure
 from .page import Origin, Report
@@ -72,26 +73,24 @@ def sky_amplitudes(frames: Sequence[SkyFringe]) -> Table:
 def write_sky_report(
     path: Path,
     frames: Sequence[SkyFringe],
-    setup: str,
+    setup: Setup,
     seed: int,
     places: VisitPlaces | None = None,
     *,
     picture: Path | None = None,
-    pixel_arcsec: float = 0.2,
     section: SensorSection | None = None,
     origin: Origin | None = None,
 ) -> Path:
     """Write the page, and ``coadd_sources.ecsv`` beside it where frames without noise are large enough.
 
     ``seed``: of places and angles of the coadds, where ``places`` are not given. ``picture``: file beside the page
-    for the first frame with all its pixels, if wanted. ``pixel_arcsec``: size of a pixel [arcsec]. ``section``:
-    pixels of the sensor that the frames show, where that is known. ``origin``: command, and pages
-    of what it was given.
+    for the first frame with all its pixels, if wanted. ``section``: pixels of the sensor that the frames show, where
+    that is known. ``origin``: command, and pages of what it was given.
     """
     first = frames[0]
     report = Report(
         f"Night sky on {first.detector or 'one sensor'}",
-        f"Set-up {setup}, filter {first.physical_filter or 'not named'}, "
+        f"Set-up {setup.name}, filter {first.physical_filter or 'not named'}, "
         f"{len(frames)} exposure{'s' if len(frames) > 1 else ''} of {first.exposure_s:g} s at airmass "
         f"{first.airmass:g}, {'with' if first.seed is not None else 'without'} noise.",
         origin or Origin(),
@@ -116,7 +115,8 @@ def write_sky_report(
         report.section("Coadds", COADDS_TEXT if places is None else COADDS_OF_VISITS_TEXT)
         report.figure(coadds_figure(found), COADDS_CAPTION)
         report.table(coadd_table(found), "coadds")
-        sources = sources_in_coadds(frames, np.random.default_rng(seed), places, pixel_arcsec=pixel_arcsec)
+        scale = setup.pixel_scale_arcsec
+        sources = sources_in_coadds(frames, np.random.default_rng(seed), places, pixel_arcsec=scale)
         if sources is not None:
             write_whole(path.with_name(SOURCES_FILE), table_text(sources))
             _show_sources(report, sources)
