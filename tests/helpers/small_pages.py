@@ -7,6 +7,7 @@ import numpy as np
 from astropy.table import Table
 from product_makers import sky, templates
 
+from lsst.fringe_sim.algorithms.coadd_sources import NightResults
 from lsst.fringe_sim.algorithms.correction.quality import FrameProof
 from lsst.fringe_sim.algorithms.discovery.verdict import (
     Gap,
@@ -21,7 +22,6 @@ from lsst.fringe_sim.algorithms.observed_frames import FrameRecord
 from lsst.fringe_sim.algorithms.sky_shift import SkyShift
 from lsst.fringe_sim.challenge.page import write_challenge_report
 from lsst.fringe_sim.challenge.result import CaseResult, ChallengeResult
-from lsst.fringe_sim.instrument.setup import Setup
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.paper.published import published_numbers
 from lsst.fringe_sim.paper.reproduce import Reproduction
@@ -130,6 +130,8 @@ def challenge(folder: Path, origin: Origin) -> Path:
     return write_challenge_report(folder / "challenge.html", ChallengeResult(7, (case,)), origin)
 
 
+NIGHT = [sky((64, 64), number, mask=np.zeros((64, 64), np.int32)) for number in (1, 2)]
+
 SMALL_PAGES: dict[str, Callable[[Path, Origin], Path]] = {
     "thickness": thickness_page,
     "discovery": lambda folder, origin: discovery_page(verdict(), origin=origin).write(
@@ -137,9 +139,9 @@ SMALL_PAGES: dict[str, Callable[[Path, Origin], Path]] = {
     ),
     "sky": lambda folder, origin: write_sky_report(
         folder / "report.html",
-        [sky((64, 64), number, mask=np.zeros((64, 64), np.int32)) for number in (1, 2)],
-        Setup.from_name("lsst_e2v"),
-        1,
+        NIGHT,
+        "lsst_e2v",
+        NightResults.of(NIGHT, 1),
         picture=folder / "sky.png",
         origin=origin,
     ),

@@ -16,6 +16,7 @@ from recorded_numbers import Record, Words
 from seen_pages import drawn
 from small_pages import WAVELENGTHS_NM, frame, smooth_map, verdict
 
+from lsst.fringe_sim.algorithms.coadd_sources import NightResults
 from lsst.fringe_sim.algorithms.coadds import Coadds
 from lsst.fringe_sim.algorithms.correction.injection import Measured, injection_table
 from lsst.fringe_sim.algorithms.discovery import Verdict
@@ -25,7 +26,6 @@ from lsst.fringe_sim.algorithms.map_on_sky import MapOnSky
 from lsst.fringe_sim.algorithms.public_evidence.verdict import KindRow
 from lsst.fringe_sim.algorithms.sky_shift import SkyShift
 from lsst.fringe_sim.instrument.camera import Camera
-from lsst.fringe_sim.instrument.setup import Setup
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.paper.published import published_numbers
 from lsst.fringe_sim.paper.reproduce import Reproduction
@@ -98,8 +98,8 @@ def sky_page(folder: Path) -> Path:
         frames.append(
             SkyFringe(image.astype(np.float32), mask, "electron", level, 30.0, 1.2, hour, None, 1e-8)
         )
-    setup = replace(Setup.from_name("lsst_e2v"), pixel_scale_arcsec=0.5)
-    return write_sky_report(folder / "sky.html", frames, setup, 1, picture=folder / "sky.png")
+    results = NightResults.of(frames, 1, pixel_arcsec=0.5)
+    return write_sky_report(folder / "sky.html", frames, "lsst_e2v", results, picture=folder / "sky.png")
 
 
 def correction_page(folder: Path) -> Path:

@@ -104,6 +104,7 @@ def sky(
       fringe-sim sky --setup monocam --thickness e2v_321 --noiseless --exptime 60s --out sky
       fringe-sim sky --thickness fit/thickness.fits --effects-file verdict/effects.py --out sky_with_effects
     """
+    from ..algorithms.coadd_sources import NightResults
     from ..instrument.flat_spectrum import FlatSpectrum
     from ..instrument.night import NightHistory
     from ..report.sky_page import write_sky_report
@@ -143,8 +144,9 @@ def sky(
     if templates:
         _write_templates(layers, model, response, folder / f"fringe_{sensor.name}", cards, sensor)
     shown: dict[str, Any] = {"section": section, "origin": origin_of(folder, given)}
+    results = NightResults.of(made, seed, places, setup.pixel_scale_arcsec)
     page = write_sky_report(
-        folder / "report.html", made, setup, seed, places, picture=folder / "sky.png", **shown
+        folder / "report.html", made, setup.name, results, picture=folder / "sky.png", **shown
     )
     for line in (*_said(made, model, contrast), folder, page):
         click.echo(str(line))
