@@ -85,7 +85,7 @@ def test_places_on_the_sky_are_those_of_the_header(rng) -> None:
 @pytest.mark.rng("visits: visits are read")
 def test_visits_are_read_and_tell_nothing(tmp_path, rng) -> None:
     thickness = random_field(SHAPE, rng, mean=16.0, span=1.0, scale=25.0)
-    night = {"setup": "lsst_e2v", "detector": "R22_S11", "visits": 2, "size": "64x64"}
+    night = {"setup": "lsst_e2v", "detector": "R22_S11", "conditions": VisitConditions(2)}
     made = list(write_mock_visits(tmp_path, thickness_um=thickness, rng=rng, **night))
     for visit in made:
         (image,) = observed_images(visit.path)
