@@ -132,6 +132,16 @@ def test_a_laboratory_has_no_sky() -> None:
         detected_sky("ts8_e2v", _sensor(), np.full((2, 2), 15.0))
 
 
+@pytest.mark.rng("maps that are no sensor")
+@pytest.mark.parametrize("shape", [(64,), (64, 60), (2, 64, 64)])
+def test_a_map_that_is_no_sensor_is_refused(shape, rng, tmp_path) -> None:
+    with pytest.raises(InputError, match=r"rows.* and .*columns"):
+        write_mock_visits(
+            tmp_path, setup="lsst_e2v", detector="R22_S11", thickness_um=np.full(shape, 15.0), rng=rng
+        )
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_the_command(tmp_path) -> None:
     arguments = ["mock-visits", str(tmp_path / "night"), "--size", "64x64", "--seed", "1", "--visits", "2"]

@@ -257,7 +257,9 @@ def write_mock_visits(
         raise OutOfRangeError("visits", visits, "1 or more")
     content = read_setup_file(setup)
     whole = Camera.from_name(str(content["camera"])).detector(detector)
-    shape = (thickness_um.shape[0], thickness_um.shape[1])
+    if np.ndim(thickness_um) != 2:
+        raise InputError("thickness map", f"{np.ndim(thickness_um)} dimensions", "rows and columns")
+    shape = (len(thickness_um), len(thickness_um[0]))
     sensor = whole if shape == whole.shape else whole.cut_down(shape)
     check_visits(setup, shape, effects, night)
     thickness = checked_thickness(thickness_um, shape)
