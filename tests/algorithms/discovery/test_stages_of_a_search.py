@@ -27,14 +27,17 @@ NAMES = ("silicon_thickness", "contrast_loss", "bandwidth", "ghost_pedestal", "a
 HIDDEN = {"silicon_thickness.offset": 0.05, "contrast_loss.factor": 0.95}
 
 
-@pytest.fixture(scope="module")
-def prepared() -> Prepared:
+def prepared_with(names: Sequence[str]) -> Prepared:
     rng = np.random.default_rng(21)
     cube, _ = expose(foreign_map(rng, (20, 24), 14.0, 14.3), HIDDEN, rng)
-    known = [one for one in EFFECTS if one.name in NAMES]
-    return prepare(
-        cube.take(np.arange(0, len(cube.image), 2)), FringeModel.from_setup("ts8_e2v"), known, 20_000
-    )
+    known = [one for one in EFFECTS if one.name in names]
+    flats = cube.take(np.arange(0, len(cube.image), 2))
+    return prepare(flats, FringeModel.from_setup("ts8_e2v"), known, 20_000)
+
+
+@pytest.fixture(scope="module")
+def prepared() -> Prepared:
+    return prepared_with(NAMES)
 
 
 def selector_of(prepared: Prepared, *, generic: bool = True) -> Selector:
@@ -162,3 +165,19 @@ def test_what_is_predicted_of_data_held_out_is_as_recorded(prepared: Prepared, r
         final = fit_model(each, (item,), np.array([item.coordinate(0.95)]), prepared.null.field)
         found.append((validate(each, null, final, out, rich=rich), disagreement_size(each, final)))
     recorded(found)
+
+
+def test_effects_that_shift_the_phase_are_looked_for_in_other_orders_as_recorded(recorded: Record) -> None:
+    """A wrong scale of the wavelengths and a tilted beam look like another thickness, a thinner silicon does not."""
+    names = ("wavelength_scale", "tilt", "silicon_thickness")
+    prepared = prepared_with(names)
+    effects = [one for one in EFFECTS if one.name in names]
+    selector = Selector(prepared.problem, effects, prepared.null, prepared.index)
+    sets = SetSearch(selector, SearchOptions(), lambda text: None, lambda found: found)
+    singles = [selector.hypothesis((name,)) for name in names]
+    assert [selector.shifts_phase(each) for each in singles] == [True, True, False]
+    recorded({
+        "singles": [told(each) for each in singles], "best": sets.best_so_far(),
+        "judged with": told(sets.to_judge_with(singles)),
+        "settled": told(selector.settled(singles[2])),
+    })  # fmt: skip
