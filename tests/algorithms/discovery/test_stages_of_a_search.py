@@ -98,6 +98,8 @@ def test_few_pixels_are_judged_by_all_their_values(prepared: Prepared) -> None:
     free = int((problem.cells.weight > 0.0).sum()) - problem.basis.size - problem.level_basis.shape[1]
     assert channel.statistic == prepared.null.chi2
     assert channel.degrees == free
+    (beside,) = selector.criticise(selector.hypothesis(("contrast_loss",)).fit)
+    assert beside.degrees == free - 1
     assert selector.evidence_of_spots(selector.null) == 0.0
 
 
