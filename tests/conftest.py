@@ -25,6 +25,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="K/N",
         help="run the K-th of N parts of the suite",
     )
+    parser.addoption("--backwards", action="store_true", help="run the last test first")
     parser.addoption("--record-numbers", action="store_true", help="write tests/records anew")
 
 
@@ -34,6 +35,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if share.has(group_of(item))]
+    if config.getoption("--backwards"):
+        items.reverse()
 
 
 @pytest.fixture(scope="session")
