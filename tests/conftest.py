@@ -1,7 +1,9 @@
 """Fixtures shared by all tests."""
 
+import logging
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +39,24 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [item for item in items if share.has(group_of(item))]
     if config.getoption("--backwards"):
         items.reverse()
+
+
+LEVEL = logging.getLogger().level
+
+
+@pytest.fixture(autouse=True)
+def _log_of_a_new_process() -> Iterator[None]:
+    """A command sets the level and the stream of the log for its process: not for the tests that come after it."""
+    _forget_log()
+    yield
+    _forget_log()
+
+
+def _forget_log() -> None:
+    root = logging.getLogger()
+    root.setLevel(LEVEL)
+    for handler in [item for item in root.handlers if type(item) is logging.StreamHandler]:
+        root.removeHandler(handler)
 
 
 @pytest.fixture(scope="session")
