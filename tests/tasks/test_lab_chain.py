@@ -90,12 +90,13 @@ def second_run(
     rafts_file: Path,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[Path, Outcome]:
-    """A copy of that repository, in which the run was repeated after the frame had been sent again."""
-    repo = Path(shutil.copytree(first_run[0], tmp_path_factory.mktemp("again") / "repo"))
+    """Another repository, in which the frame was sent again and what had failed has run again."""
+    repo = Path(shutil.copytree(first_run[0], tmp_path_factory.mktemp("lab") / "repo"))
     _, dark, flat = spoiled
     shutil.copyfile(flat, dark)
-    skip = ("--skip-existing-in", "u/lab")
-    return repo, run_lab(command, repo, "u/lab", "-C", f"epoxyFit:{rafts_file}", *skip)
+    return repo, run_lab(
+        command, repo, "u/lab", "-C", f"epoxyFit:{rafts_file}", "--skip-existing-in", "u/lab"
+    )
 
 
 def fitted(repo: Path, collection: str) -> set[int]:
@@ -241,8 +242,8 @@ def test_override_of_one_raft_within_a_run_of_all(second_run: tuple[Path, Outcom
     assert "EFFECT0" not in other
 
 
-def test_override_of_one_raft_in_a_run_of_its_own(command: Command, first_run: tuple[Path, Outcome]) -> None:
-    repo, _ = first_run
+def test_override_of_one_raft_in_a_run_of_its_own(command: Command, second_run: tuple[Path, Outcome]) -> None:
+    repo, _ = second_run
     file = Path(__file__).parents[2] / "config" / "ts8" / "rafts" / "RTM-020.py"
     outcome = run_lab(
         command,
