@@ -9,6 +9,7 @@ from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.correction import AmplifierGrid
 from lsst.fringe_sim.algorithms.correction.detection import log_evidence
+from lsst.fringe_sim.algorithms.correction.scales import steady_weight
 from lsst.fringe_sim.algorithms.fringe_correction import (
     CorrectionOptions,
     component_patterns,
@@ -450,3 +451,20 @@ def test_bad_input_is_named(patterns):
         AmplifierGrid(0, 2)
     with pytest.raises(InputError, match="thickness map"):
         component_patterns(np.full((2, 2), np.nan), None)
+
+
+@pytest.mark.parametrize(
+    ("noise", "is_refused"), [(0.97e-15, True), (1.03e-15, False), (0.97e15, False), (1.03e15, True)]
+)
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.rng("noise in odd units")
+def test_noise_whose_squares_single_precision_does_not_hold_is_refused(noise, is_refused, known, rng) -> None:
+    image = noise * rng.normal(size=(512, 512))
+    # What neighbours scatter about each other is known to half a percent.
+    variance = np.full(image.shape, noise**2) if known else None
+    good = np.ones(image.shape, dtype=bool)
+    if is_refused:
+        with pytest.raises(OutOfRangeError, match="noise of a pixel"):
+            steady_weight(good, variance, image)
+    else:
+        np.testing.assert_allclose(steady_weight(good, variance, image), noise**-2, rtol=0.02)

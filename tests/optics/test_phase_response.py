@@ -1,5 +1,7 @@
 """The closed form and its harmonic series against the transfer matrix, and against each other."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -99,6 +101,23 @@ def test_a_tolerance_is_kept(
     found = series_on_grid(arrays, weights, spread_um, *grid, tolerance=tolerance)
     assert np.abs(found - exact).max() < tolerance * np.ptp(exact)
     assert tolerance < 1e-11 or np.any(found != exact)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.05])
+@pytest.mark.rng("a further wave")
+def test_a_further_wave_is_a_part_of_the_mean_over_all_phases(loss: float, rng: np.random.Generator) -> None:
+    response, _ = random_response(rng, 0.6, loss)
+    response = replace(response, kappa=np.broadcast_to(response.kappa[:1], response.kappa.shape))
+    cosine, sine = rng.normal(size=(2, *response.node_shape))
+    thickness = 3.0 + 0.1 * np.arange(7)[:, np.newaxis, np.newaxis]
+    added = response.with_harmonic(2, cosine, sine).evaluate(thickness) - response.evaluate(thickness)
+    # Where nothing is absorbed the mean is that of many phases of one period, where it is, of a layer without end.
+    period = 2.0 * np.pi / response.kappa[0].real * np.linspace(0.0, 1.0, 200, endpoint=False)[:, None, None]
+    mean = response.evaluate(period).mean(axis=0) if loss == 0.0 else response.evaluate(1e6)
+    phase = 2.0 * response.kappa[0].real * thickness
+    fading = np.exp(-2.0 * response.kappa[0].imag * thickness)
+    expected = mean * fading * (cosine * np.cos(phase) + sine * np.sin(phase))
+    np.testing.assert_allclose(added, expected, atol=1e-12)
 
 
 @pytest.mark.rng("grid is the points")

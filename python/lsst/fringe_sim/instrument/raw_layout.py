@@ -162,7 +162,7 @@ def _read_sections(number: int, hdu: Any, order: int, source: str, lsst: bool) -
         )
     _refuse_changed_pixels(hdu.header, name, source)
     _refuse_other_overscan(hdu.header, name, datasec, source)
-    if hdu.header.get("BITPIX", 0) < 0:
+    if hdu.header["BITPIX"] < 0:
         raise FrameFormatError(
             f"{name} BITPIX", hdu.header["BITPIX"], "8, 16, 32 or 64: integer ADU", source=source
         )
