@@ -15,7 +15,16 @@ from lsst.fringe_sim.algorithms.discovery.marginal.naming import name_effects
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
 from lsst.fringe_sim.algorithms.discovery.marginal.scores import Scorer, best_gain
 from lsst.fringe_sim.algorithms.discovery.marginal.search import Catalogue, SetSearch
-from lsst.fringe_sim.algorithms.inference import CellShape, Data, Forward, Hypothesis, Problem, fit, relaxed
+from lsst.fringe_sim.algorithms.inference import (
+    CellShape,
+    Data,
+    Forward,
+    Hypothesis,
+    Point,
+    Problem,
+    fit,
+    relaxed,
+)
 from lsst.fringe_sim.algorithms.inference.coordinates import SECANT
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.model import FringeModel
@@ -98,6 +107,37 @@ def test_an_effect_is_hoped_to_bring_no_more_than_it_has_brought(rng: np.random.
     assert before == pytest.approx(max(scored["bandwidth"].gain, 0.0) / Rules().least_of_promise)
     brings = search._added(search.null, scored["bandwidth"]).log_evidence - search.null.log_evidence
     assert search.hoped(replace(scored["bandwidth"], gain=1e6)) == pytest.approx(max(brings, 0.0))
+
+
+@pytest.mark.rng("orders of a set")
+def test_a_set_whose_cells_lie_an_order_off_is_found_in_the_right_one(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is fitted where its cells are likeliest, and an order on either side, unless it leaves noise as it is."""
+    search = search_of(rng, {})
+    names, items = ("wavelength_offset",), search.catalogue.items["wavelength_offset"]
+    right = replace(search.null, effects=names, items=items)
+    order_um = right.point.problem.forward.order_um
+    starts: list[float] = []
+
+    def fitted_from(effects: tuple[str, ...], coordinates: object, point: Point) -> Hypothesis:
+        assert (effects, coordinates) == (names, items)
+        away = np.median(point.thickness_um - right.point.thickness_um) / order_um
+        starts.append(round(float(away)))
+        return right if starts[-1] == 0 else replace(right, point=point, log_evidence=-1e6)
+
+    monkeypatch.setattr(search, "_fit", fitted_from)
+    for off, tried in ((0, [-1, 1]), (1, [0, 0, 2]), (-1, [0, -2, 0])):
+        moved = right.point.moved(right.point.levels, right.point.thickness_um + off * order_um)
+        wrong = replace(right, point=moved, log_evidence=right.log_evidence - abs(off))
+        search.pool = {frozenset(): search.null, frozenset(names): wrong}
+        search.leaves_noise = lambda found: True
+        assert search._in_orders(1) == [wrong]
+        assert starts == []
+        search.leaves_noise = lambda found: False
+        assert search._in_orders(1) == [right if off else wrong]
+        assert starts == tried
+        starts.clear()
 
 
 @pytest.mark.parametrize(
