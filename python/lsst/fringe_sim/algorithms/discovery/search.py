@@ -171,8 +171,6 @@ def _why_not_marginal(cube: FringeCube, exposures: Exposures | None) -> str:
     """Why the search on one likelihood cannot search such data, or nothing."""
     if exposures is not None:
         return "light of the sky"
-    if cube.thickness is not None:
-        return "a thickness that is known"
     if min(cube.shape[1:]) < MARGINAL_ROWS:
         return f"fewer than {MARGINAL_ROWS} rows or columns of pixels"
     return ""
