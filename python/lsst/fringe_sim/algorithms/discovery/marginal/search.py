@@ -23,6 +23,7 @@ from ...inference import (
     in_whole_orders,
     joined,
     jumped,
+    led,
 )
 from ...inference.marginal import Point
 from .pace import Pace
@@ -239,7 +240,7 @@ class SetSearch:
     def _in_orders(self, size: int) -> list[Hypothesis]:
         """All sets of so many effects, the best of them in other fringe orders too where none leaves noise."""
         grown = self._of_size(size)
-        if not grown or self.leaves_noise(grown[0]):
+        if not grown or self.null.point.problem.known or self.leaves_noise(grown[0]):
             return grown
         for found in grown[: self.rules.beam]:
             point, order_um = found.point, found.point.problem.forward.order_um
@@ -367,7 +368,7 @@ class SetSearch:
         """All effects that a set lacks, by what one derivative promises; best first."""
         key = frozenset(base.effects)
         if key not in self._scores:
-            point = base.point
+            point = led(base.point)
             columns = point.level_columns
             if base.items:
                 columns = joined(columns, effect_columns(point, base.items))
@@ -379,8 +380,7 @@ class SetSearch:
                 effect = self.catalogue.effects[name]
                 sought = effect.search.sought or effect.local
                 one = proposed(effect, items, base) if sought else scorer.score(name, items)
-                if one is not None:
-                    found.append(one)
+                found += [one] if one is not None else []
             self._scores[key] = sorted(found, key=lambda one: -one.gain)
             self._joint[key] = scorer.joint()
         return self._scores[key]

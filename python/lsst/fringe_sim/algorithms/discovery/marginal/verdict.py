@@ -327,7 +327,8 @@ class MarginalSearch:
             {"name": one.name, "score": one.fall, "degrees": one.degrees}
             for one in sorted(self.sets.scores(null), key=lambda one: -one.fall)
         ]
-        rounds = [self.sets.best_of(size)[0] for size in range(1, len(found.effects))]
+        # Of sets that fell far behind none is left.
+        rounds = [own[0] for size in range(1, len(found.effects)) if (own := self.sets.best_of(size))]
         steps = steps_of(prepared, [*rounds, found] if found.effects else [], self._leaves_noise)
         return Verdict(
             word, effects,
