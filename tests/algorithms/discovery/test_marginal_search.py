@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
+from lsst.fringe_sim.algorithms.discovery.marginal import preparation
 from lsst.fringe_sim.algorithms.discovery.marginal.preparation import Prepared, prepare
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
 from lsst.fringe_sim.effects import known_effects
@@ -123,3 +124,26 @@ def test_pixels_see_a_point_or_their_area_by_the_likelihood(places: int, rng: np
 def test_another_core_is_refused() -> None:
     with pytest.raises(UnknownNameError, match="core"):
         SearchOptions(core="newest")
+
+
+@pytest.mark.parametrize("per_cell", [0.0, 0.3, 0.45])
+def test_cells_at_a_rim_in_another_order_do_not_steepen_it(per_cell: float) -> None:
+    """A sensor that is as steep as that, or not, keeps its thickness; cells beside a block without data come back."""
+    order_um = 0.3
+    y, x = np.mgrid[:16, :16]
+    field = 15.0 + order_um * per_cell * (0.8 * y + 0.6 * x)
+    seen = ~((y >= 8) & (x < 8))
+    wrong = field.copy()
+    wrong[9:12, 8] += order_um
+    wrong[10, 9] += order_um
+    found = preparation._in_order_of_neighbours(wrong, seen, order_um)
+    np.testing.assert_allclose(found[seen], field[seen], atol=1e-9)
+
+
+def test_half_an_order_on_an_island_is_kept() -> None:
+    """What a thin gap does to the thickness is no other order."""
+    order_um = 0.3
+    y, x = np.mgrid[:16, :16]
+    field = 15.0 + 0.4 * order_um * (np.hypot(y - 8, x - 8) < 3)
+    found = preparation._in_order_of_neighbours(field, np.ones(field.shape, dtype=bool), order_um)
+    np.testing.assert_array_equal(found, field)
