@@ -39,6 +39,7 @@ MARGIN_UM = 0.8
 
 FIRST_ERROR_UM = 0.004  # Error of the first thickness [µm]: it is one of steps of 0.01
 SURFACE_CELLS = 8.0  # Distance of the knots of the surface whose slope limits the size of cells [cells]
+AROUND = 5  # Side of the part about a cell whose median tells its fringe order [cells]
 KNOWN_UM = 1e-6  # Error of a thickness that is known [µm]
 
 NO_SCATTER, FIRST_SCATTER = 1e-6, 0.003
@@ -256,8 +257,36 @@ def _left(point: Point, cells: CellData) -> FloatArray:
 
 
 def _whole(point: Point, cells: CellData) -> FloatArray:
-    """Thickness of all cells, ``(ny, nx)``; where there are no data, continued from where there are."""
-    return continued(point.thickness_um.reshape(cells.shape[1:]), cells.seen)
+    """Thickness of all cells, ``(ny, nx)``, in the orders of their neighbours.
+
+    Where there are no data, it is continued from where there are.
+    """
+    field = point.thickness_um.reshape(cells.shape[1:])
+    return continued(_in_order_of_neighbours(field, cells.seen, point.problem.forward.order_um), cells.seen)
+
+
+def _in_order_of_neighbours(field: FloatArray, seen: BoolArray, order_um: float) -> FloatArray:
+    """A thickness moved by whole fringe orders to within half of one of its neighbours, whose medians are a plane.
+
+    A few cells in another order, mostly at the rim of a part without data, have a slope that is an order per cell.
+    With that slope they fit best where they are.
+    """
+    known = np.where(seen, field, np.nan)
+    middle = _around(known, seen)
+    for axis, away in enumerate(np.indices((AROUND, AROUND)).reshape(2, -1) - AROUND // 2):
+        steps = _around(np.diff(known, axis=axis, append=np.nan), seen)
+        steps[np.isnan(steps).all(axis=-1)] = 0.0
+        middle -= np.nanmedian(steps, axis=-1)[:, np.newaxis] * away
+    whole = field.copy()
+    whole[seen] -= order_um * np.round((field[seen] - np.nanmedian(middle, axis=-1)) / order_um)
+    return whole
+
+
+def _around(values: FloatArray, where: BoolArray) -> FloatArray:
+    """Values about every place that is asked for, ``(N, AROUND²)``; beyond the edges there are none."""
+    padded = np.pad(values, AROUND // 2, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (AROUND, AROUND))
+    return np.array(windows[where].reshape(-1, AROUND**2))
 
 
 def _data(cells: CellData) -> Data:

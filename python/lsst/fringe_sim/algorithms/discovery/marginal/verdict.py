@@ -25,6 +25,7 @@ from ..preparation import headers_apart
 from ..verdict import Gap, NamedEffect, Verdict
 from ..verdict_words import METRIC, WITHIN_ACCURACY, chance_text, said_of_left_out
 from .accuracy import told_accuracy
+from .catalogue import Catalogue
 from .critics import is_out_of_reach, judge, state_of, total_chance
 from .heldout import Unseen, judge_unseen, rms_unseen
 from .lesson import CellLesson, CellPart, with_corrections
@@ -32,7 +33,7 @@ from .naming import Naming, name_effects
 from .next_flats import FlatForecast
 from .preparation import prepare, prepare_again
 from .rules import Rules
-from .search import Catalogue, SetSearch
+from .search import SetSearch
 from .steps import told_of_steps
 from .telling import data_of, rms_left, size_of, steps_of
 
