@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery.channels import Channel
+from lsst.fringe_sim.algorithms.discovery.marginal.catalogue import Catalogue
 from lsst.fringe_sim.algorithms.discovery.marginal.critics import is_out_of_reach
 from lsst.fringe_sim.algorithms.discovery.marginal.naming import name_effects
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
 from lsst.fringe_sim.algorithms.discovery.marginal.scores import Scorer, best_gain
-from lsst.fringe_sim.algorithms.discovery.marginal.search import Catalogue, SetSearch
+from lsst.fringe_sim.algorithms.discovery.marginal.search import SetSearch
 from lsst.fringe_sim.algorithms.inference import (
     CellShape,
     Data,

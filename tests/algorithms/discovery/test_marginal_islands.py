@@ -11,9 +11,9 @@ from scipy.interpolate import RectBivariateSpline
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, discover
 from lsst.fringe_sim.algorithms.discovery.marginal import critics
+from lsst.fringe_sim.algorithms.discovery.marginal.catalogue import Catalogue
 from lsst.fringe_sim.algorithms.discovery.marginal.critics import judge, spot_scores
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
-from lsst.fringe_sim.algorithms.discovery.marginal.search import Catalogue
 from lsst.fringe_sim.algorithms.discovery.marginal.smooth import beside_smooth
 from lsst.fringe_sim.algorithms.inference import (
     CellShape,

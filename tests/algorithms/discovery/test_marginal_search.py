@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
+from lsst.fringe_sim.algorithms.discovery.marginal import preparation
 from lsst.fringe_sim.algorithms.discovery.marginal.preparation import Prepared, _in_parts, prepare
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
 from lsst.fringe_sim.algorithms.inference import CellShape
@@ -153,3 +154,26 @@ def test_the_thickness_of_larger_cells_is_continued_within_them() -> None:
     np.testing.assert_allclose(shape.gradient[1, inside], -0.02 + 3e-3 * y - 4e-3 * x, atol=1e-12)
     np.testing.assert_array_equal(shape.hessian[:, inside], bent[:, : inside.sum()][:, :1] + 0.0 * y)
     assert (shape.cell_px, shape.area) == (2, True)
+
+
+@pytest.mark.parametrize("per_cell", [0.0, 0.3, 0.45])
+def test_cells_at_a_rim_in_another_order_do_not_steepen_it(per_cell: float) -> None:
+    """A sensor that is as steep as that, or not, keeps its thickness; cells beside a block without data come back."""
+    order_um = 0.3
+    y, x = np.mgrid[:16, :16]
+    field = 15.0 + order_um * per_cell * (0.8 * y + 0.6 * x)
+    seen = ~((y >= 8) & (x < 8))
+    wrong = field.copy()
+    wrong[9:12, 8] += order_um
+    wrong[10, 9] += order_um
+    found = preparation._in_order_of_neighbours(wrong, seen, order_um)
+    np.testing.assert_allclose(found[seen], field[seen], atol=1e-9)
+
+
+def test_half_an_order_on_an_island_is_kept() -> None:
+    """What a thin gap does to the thickness is no other order."""
+    order_um = 0.3
+    y, x = np.mgrid[:16, :16]
+    field = 15.0 + 0.4 * order_um * (np.hypot(y - 8, x - 8) < 3)
+    found = preparation._in_order_of_neighbours(field, np.ones(field.shape, dtype=bool), order_um)
+    np.testing.assert_array_equal(found, field)

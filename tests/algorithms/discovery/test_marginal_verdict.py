@@ -191,10 +191,10 @@ def test_the_significance_is_that_which_was_asked_for(rng: np.random.Generator) 
 def test_what_the_present_search_answers_is_said(rng: np.random.Generator) -> None:
     cube = cube_of(rng, flats_of({}))
     assert search._why_not_marginal(cube, None) == ""
-    small = replace(cube, image=cube.image[:, :20], variance=cube.variance[:, :20], mask=cube.mask[:, :20])
-    assert "24 rows" in search._why_not_marginal(small, None)
+    small = replace(cube, image=cube.image[:, :12], variance=cube.variance[:, :12], mask=cube.mask[:, :12])
+    assert "16 rows" in search._why_not_marginal(small, None)
     known = np.full((SIDE, SIDE), 15.0, np.float32)
-    assert "known" in search._why_not_marginal(replace(cube, thickness=known, layer="adhesive"), None)
+    assert search._why_not_marginal(replace(cube, thickness=known, layer="adhesive"), None) == ""
     told = verdict_of(small, "vignetting")
     assert any("the present search answers" in note for note in told.notes)
 

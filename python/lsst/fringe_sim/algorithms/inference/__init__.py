@@ -1,6 +1,7 @@
 """The core of the inference: one log marginal likelihood by which everything is compared."""
 
 from .cell_average import CellShape
+from .common_offset import led, with_common_offset
 from .coordinates import Coordinate, coordinates_of
 from .forward import Forward
 from .marginal import Columns, Data, Point, Problem, joined
@@ -31,6 +32,8 @@ __all__ = [
     "in_whole_orders",
     "joined",
     "jumped",
+    "led",
     "relaxed",
+    "with_common_offset",
     "with_free_contrast",
 ]

@@ -36,11 +36,16 @@ class Problem:
     thickness_um: FloatArray  # (N,): the first thickness, about which that of a cell is Gaussian
     response_sigma: float  # prior of the response of a cell
     thickness_sigma_um: float | FloatArray = 10.0  # of all or each; many orders pull no cell and favour none
+    known: bool = False  # whether the first thickness is measured: it stays, and no cell changes its order
 
     def at(self, settings: Mapping[str, float], levels: FloatArray, thickness_um: FloatArray) -> Point:
         """The likelihood linearised about effects, levels ``(W,)`` and thickness ``(N,)``."""
         value, slope = self.forward.predict(settings, thickness_um)
         return Point(self, dict(settings), levels, thickness_um, value, slope)
+
+    def about(self, thickness_um: FloatArray) -> Problem:
+        """The same about another first thickness ``(N,)``; one that is known stays."""
+        return self if self.known else replace(self, thickness_um=thickness_um)
 
 
 @dataclass(frozen=True, eq=False)

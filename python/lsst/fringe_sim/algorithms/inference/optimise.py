@@ -130,7 +130,11 @@ def jumped(point: Point, items: Sequence[Coordinate], values: Sequence[float]) -
     """Another value of some parameters, with the thickness that goes with it, and relaxed.
 
     The thickness follows in strides that are short beside a fringe order; a longer one ends in a wrong order.
+    One that is known is where it was measured.
     """
+    if point.problem.known:
+        settings = {**point.settings, **{i.key: i.clipped(v) for i, v in zip(items, values, strict=True)}}
+        return relaxed(point.moved(point.levels, point.problem.thickness_um, settings), rounds=2)
     begin = np.array([point.settings.get(item.key, item.null) for item in items])
     change = np.array([i.clipped(v) for i, v in zip(items, values, strict=True)]) - begin
 
@@ -177,7 +181,10 @@ def in_whole_orders(point: Point, odds: float, rounds: int = 2) -> Point:
 
     A part is a cell with its neighbours, or alone if it is sure. ``odds``: logarithm of those for which a part is
     moved; that it is one of so many parts which is in another order is the less likely, the more parts there are.
+    A thickness that is known stays.
     """
+    if point.problem.known:
+        return point
     shape, order_um = point.problem.forward.geometry.sample_shape, point.problem.forward.order_um
     turns = np.arange(-MOST_TURNS, MOST_TURNS + 1)
     found = []

@@ -112,7 +112,7 @@ def _fitted(prepared: Prepared, point: Point, shape: CellShape) -> Point:
     ``point``: at all cells. ``shape``: that of the cells.
     """
     forward, start = replace(point.problem.forward, shape=shape), point.thickness_um
-    problem = replace(point.problem, data=data_of(prepared.unseen), forward=forward, thickness_um=start)
+    problem = replace(point.problem.about(start), data=data_of(prepared.unseen), forward=forward)
     return in_own_cells(problem.at(point.settings, point.levels, start))
 
 

@@ -171,7 +171,7 @@ class CellLesson:
         left = (start.problem.data.value - start.levels[:, np.newaxis] * start.value).reshape(cells.shape)
         cells = cells.restricted(~(spoiled_cells(left, cells.weight > 0.0) & unseen))
         # Cells without data stay where they were.
-        problem = replace(start.problem, data=data_of(cells), thickness_um=start.thickness_um)
+        problem = replace(start.problem.about(start.thickness_um), data=data_of(cells))
         return cls(found, problem, cells, unseen, start)
 
     @property
@@ -229,6 +229,8 @@ def unseen_too(prepared: Prepared, point: Point, cells: CellData) -> Point:
     known, shape = prepared.cells.seen, cells.shape[1:]
     away = distance_transform_edt(~known)
     point = point.problem_with(data_of(cells))
+    if point.problem.known:
+        return point  # they are where it has them
     reach = 1.0
     while not known.all():
         start = continued(point.thickness_um.reshape(shape), known).ravel()

@@ -150,7 +150,11 @@ class FlatForecast:
         asked = np.concatenate([one.asked for one in seen], axis=1)
         at = self.best.point.thickness_um[self._order]
         data = Data(value, weight)
-        problem = replace(self.best.point.problem, data=data, thickness_um=at)
+        problem = self.best.point.problem
+        # Each stands for several, which are known better together.
+        several = problem.data.seen.sum() / len(at)
+        sigma = np.broadcast_to(problem.thickness_sigma_um, problem.thickness_um.shape)[self._order]
+        problem = replace(problem, data=data, thickness_um=at, thickness_sigma_um=sigma / np.sqrt(several))
         point = Point(problem, {}, np.ones(len(value)), at, value, slope)
         columns = point.bare_columns(point.whitened(asked))
         planes = np.arange(len(value))

@@ -20,7 +20,9 @@ from ...inference import (
     Point,
     Problem,
     fit,
+    in_best_orders,
     in_whole_orders,
+    with_common_offset,
     with_free_contrast,
 )
 from ..cells import CellData, bin_cube, finest_useful_cell
@@ -28,6 +30,7 @@ from ..continuation import continued
 from ..outliers import spoiled_cells
 from ..start import robust_surface, starting_thickness
 from ..validation import BLOCKS_ACROSS, FEWEST_ROWS
+from .known_thickness import as_known, stated_sigma_um, with_error_of_map
 from .noise import measured_noise, neighbour_scatter
 from .rules import Rules
 
@@ -36,6 +39,7 @@ MARGIN_UM = 0.8
 
 FIRST_ERROR_UM = 0.004  # Error of the first thickness [µm]: it is one of steps of 0.01
 SURFACE_CELLS = 8.0  # Distance of the knots of the surface whose slope limits the size of cells [cells]
+AROUND = 5  # Side of the part about a cell whose median tells its fringe order [cells]
 KNOWN_UM = 1e-6  # Error of a thickness that is known [µm]
 
 NO_SCATTER, FIRST_SCATTER = 1e-6, 0.003
@@ -74,6 +78,8 @@ def prepare(
     held = _held_out(cube.shape[1:], rules.heldout_fraction, rng)
     size = finest_useful_cell(_masked(cube, held), most_cells=most_cells)
     prepared = _in_cells(cube, held, size, model, effects, rules)
+    if prepared.problem.known:
+        return prepared
     turn = 2.0 * np.pi / prepared.problem.forward.order_um
     # Smaller ones than are needed may be in wrong orders, and tell nothing of larger ones.
     while turn * _thickness_error_um(prepared.free) > rules.phase_error:
@@ -146,24 +152,31 @@ def _in_cells(
     unseen = (
         bin_cube(_masked(cube, ~held), size) if held.any() else cells.restricted(np.zeros(cells.shape, bool))
     )
-    first = continued(starting_thickness(model, cells), cells.seen)
-    problem = _problem(cells, model, effects, first)
+    stated = cells.thickness_um
+    first = continued(starting_thickness(model, cells) if stated is None else stated, cells.seen)
+    problem = as_known(_problem(cells, model, effects, first), cells)
     # The first thickness does not believe in the contrast of the model; it stays until that of the data is known.
     known = replace(problem, thickness_sigma_um=KNOWN_UM)
-    point = with_free_contrast(known.at({}, np.ones(cells.shape[0]), problem.thickness_um))
-    problem = replace(problem, forward=point.problem.forward)
-    point = with_free_contrast(problem.at({}, point.levels, problem.thickness_um))
-    point = in_whole_orders(point, rules.class_width)
+    start = known.at({}, np.ones(cells.shape[0]), problem.thickness_um)
+    point = with_free_contrast(with_common_offset(start))
+    about = point.problem.thickness_um
+    problem = replace(problem, forward=point.problem.forward, thickness_um=about)
+    point = with_free_contrast(problem.at({}, point.levels, about))
+    point = in_best_orders(point) if problem.known else in_whole_orders(point, rules.class_width)
     factor = np.ones(cells.shape[0])
     for _ in range(2):
         spoiled = spoiled_cells(_left(point, cells), cells.weight > 0.0)
         cells, noise, problem = _judged(cells.restricted(~spoiled), point)
         factor = factor * noise
-        point = with_free_contrast(problem.at({}, point.levels, problem.thickness_um), rounds=4)
+        start_um = point.thickness_um if problem.known else problem.thickness_um
+        point = with_free_contrast(problem.at({}, point.levels, start_um), rounds=4)
         point = _with_likelier_pixels(point, rules)
     unseen = unseen.scaled_noise(factor, cells.response_scatter)
-    problem = _as_modelled(point.problem)
-    null = fit((), (), problem.at({}, point.levels, point.thickness_um), aim=point.cost)
+    problem, thickness = _as_modelled(point.problem), point.thickness_um
+    if problem.known:  # where the map has it, not where the judgement of the noise has moved it
+        thickness = thickness - problem.thickness_um + first.ravel()
+        problem = replace(problem, thickness_um=first.ravel())
+    null = fit((), (), problem.at({}, point.levels, thickness), aim=point.cost)
     return Prepared(cells, unseen, problem, null, factor, point)
 
 
@@ -194,7 +207,7 @@ def _steepest_um(prepared: Prepared) -> float:
 
 def prepare_again(prepared: Prepared, found: Hypothesis, rules: Rules) -> Prepared:
     """Noise, and what pixels see and the thickness does within cells, as judged with effects in the model."""
-    point = _with_likelier_pixels(with_free_contrast(found.point), rules)
+    point = _with_likelier_pixels(with_free_contrast(with_common_offset(found.point)), rules)
     cells, noise, problem = _judged(prepared.cells, point)
     # Every fit may return to the first thickness, whatever has been fitted since.
     problem = replace(_as_modelled(problem), thickness_um=prepared.problem.thickness_um)
@@ -214,7 +227,7 @@ def _judged(cells: CellData, point: Point) -> tuple[CellData, FloatArray, Proble
     """Cells with the noise that a fit leaves, its measured over stated deviation, and the problem about the fit."""
     expected = (point.levels[:, np.newaxis] * point.value).reshape(cells.shape)
     cells = cells.with_noise_of(expected)
-    point = point.problem_with(_data(cells))
+    point = with_error_of_map(point.problem_with(_data(cells)), cells)
     noise, scatter = measured_noise(point, cells.shape)
     cells = cells.scaled_noise(noise, scatter)
     old, thickness = point.problem.forward, _whole(point, cells)
@@ -228,10 +241,9 @@ def _judged(cells: CellData, point: Point) -> tuple[CellData, FloatArray, Proble
     shape = CellShape.of_field(thickness, cells.cell_px, error, area=old.shape.area)
     forward = replace(old, shape=shape, geometry=geometry)
     problem = replace(
-        point.problem,
+        point.problem.about(thickness.ravel()),
         data=_data(cells),
         forward=forward,
-        thickness_um=thickness.ravel(),
         response_sigma=max(scatter, NO_SCATTER),
     )
     return cells, noise, problem
@@ -245,8 +257,36 @@ def _left(point: Point, cells: CellData) -> FloatArray:
 
 
 def _whole(point: Point, cells: CellData) -> FloatArray:
-    """Thickness of all cells, ``(ny, nx)``; where there are no data, continued from where there are."""
-    return continued(point.thickness_um.reshape(cells.shape[1:]), cells.seen)
+    """Thickness of all cells, ``(ny, nx)``, in the orders of their neighbours.
+
+    Where there are no data, it is continued from where there are.
+    """
+    field = point.thickness_um.reshape(cells.shape[1:])
+    return continued(_in_order_of_neighbours(field, cells.seen, point.problem.forward.order_um), cells.seen)
+
+
+def _in_order_of_neighbours(field: FloatArray, seen: BoolArray, order_um: float) -> FloatArray:
+    """A thickness moved by whole fringe orders to within half of one of its neighbours, whose medians are a plane.
+
+    A few cells in another order, mostly at the rim of a part without data, have a slope that is an order per cell.
+    With that slope they fit best where they are.
+    """
+    known = np.where(seen, field, np.nan)
+    middle = _around(known, seen)
+    for axis, away in enumerate(np.indices((AROUND, AROUND)).reshape(2, -1) - AROUND // 2):
+        steps = _around(np.diff(known, axis=axis, append=np.nan), seen)
+        steps[np.isnan(steps).all(axis=-1)] = 0.0
+        middle -= np.nanmedian(steps, axis=-1)[:, np.newaxis] * away
+    whole = field.copy()
+    whole[seen] -= order_um * np.round((field[seen] - np.nanmedian(middle, axis=-1)) / order_um)
+    return whole
+
+
+def _around(values: FloatArray, where: BoolArray) -> FloatArray:
+    """Values about every place that is asked for, ``(N, AROUND²)``; beyond the edges there are none."""
+    padded = np.pad(values, AROUND // 2, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (AROUND, AROUND))
+    return np.array(windows[where].reshape(-1, AROUND**2))
 
 
 def _data(cells: CellData) -> Data:
@@ -257,7 +297,8 @@ def _problem(
     cells: CellData, model: FringeModel, effects: Sequence[Effect], thickness_um: FloatArray
 ) -> Problem:
     """Problem about a first thickness ``(ny, nx)``."""
-    shape = CellShape.of_field(thickness_um, cells.cell_px, FIRST_ERROR_UM)
+    error = FIRST_ERROR_UM if cells.thickness_um is None else float(np.median(stated_sigma_um(cells)))
+    shape = CellShape.of_field(thickness_um, cells.cell_px, error)
     limits = (max(float(thickness_um.min()) - MARGIN_UM, 0.05), float(thickness_um.max()) + MARGIN_UM)
     centroid = None
     if cells.centroid is not None:

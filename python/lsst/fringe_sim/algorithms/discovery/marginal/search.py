@@ -5,26 +5,24 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ....array_types import FloatArray
-from ....effects import Effect
-from ....effects.base import numbered
-from ....errors import InputError, OutOfRangeError
+from ....errors import OutOfRangeError
 from ...inference import (
     Coordinate,
-    Forward,
     Hypothesis,
-    coordinates_of,
     effect_columns,
     fit,
     in_whole_orders,
     joined,
     jumped,
+    led,
 )
 from ...inference.marginal import Point
+from .catalogue import Catalogue
 from .pace import Pace
 from .pairs import Joint
 from .rules import Rules
@@ -32,63 +30,6 @@ from .scores import Scored, Scorer, best_gain, proposed
 
 PARTS = 1.0, 0.3
 """Parts of a linear step of several parameters from which they are fitted: the whole may lead too far."""
-
-
-@dataclass(frozen=True, eq=False)
-class Catalogue:
-    """Effects that can be looked for, and why others are left out."""
-
-    items: dict[str, tuple[Coordinate, ...]]
-    effects: dict[str, Effect]
-    left_out: dict[str, str]
-    before: dict[str, str]  # of the second, third, ... of an effect the one before
-
-    @classmethod
-    def of(cls, effects: Sequence[Effect], forward: Forward, most: int = 1) -> Catalogue:
-        """Coordinates of all effects of a catalogue that these exposures can see.
-
-        ``most``: of an effect of which a sensor may have several.
-        """
-        items: dict[str, tuple[Coordinate, ...]] = {}
-        left_out: dict[str, str] = {}
-        before: dict[str, str] = {}
-        for effect in effects:
-            try:
-                own = coordinates_of(effect, forward)
-                _try(own, forward)
-            except InputError as error:
-                left_out[effect.name] = str(error)
-                continue
-            if effect.local and type(effect).propose is Effect.propose:
-                left_out[effect.name] = (
-                    "a place that no derivative leads to, and the new core has no starts for it yet"
-                )
-                continue
-            items[effect.name], last = own, effect
-            for number in range(2, most + 1) if effect.several else ():
-                another = numbered(effect, number)
-                items[another.name] = tuple(replace(item, effect=another.name) for item in own)
-                effects, before, last = (*effects, another), {**before, another.name: last.name}, another
-        return cls(items, {effect.name: effect for effect in effects}, left_out, before)
-
-    @property
-    def price(self) -> float:
-        """Log of the odds against any one effect before the data are seen."""
-        return math.log(max(len(self.items) - len(self.before), 2))
-
-    def may_add(self, name: str, effects: Sequence[str]) -> bool:
-        """Whether an effect can be one more of a set."""
-        return name not in effects and self.before.get(name, name) in (name, *effects)
-
-    def may_leave(self, names: Sequence[str], effects: Sequence[str]) -> bool:
-        """Whether a set without some members is another one, without the second of an effect whose first is gone."""
-        return all(self.before.get(other) not in names for other in effects if other not in names)
-
-
-def _try(items: tuple[Coordinate, ...], forward: Forward) -> None:
-    """Raise what an effect raises on these data."""
-    middle = np.full(forward.shape.gradient.shape[1], 0.5 * sum(forward.range_um))
-    forward.predict({item.key: item.null + item.difference(item.null) for item in items[:1]}, middle)
 
 
 @dataclass(eq=False)
@@ -132,7 +73,7 @@ class SetSearch:
         top = self._settled(grown[0]) if size > 1 else grown[0]
         gained = top.log_evidence - self.null.log_evidence
         self.say(f"best of {size}: {', '.join(top.effects)} (log evidence {gained:.1f})")
-        return top if self._is_surely_better(top, best) else best
+        return self._surely(top, best)
 
     def settled(self, before: Hypothesis) -> Hypothesis:
         """The best set of as many effects at most as one that was settled before the problem was judged again.
@@ -148,7 +89,27 @@ class SetSearch:
         smaller = max(
             (one for one in self.pool.values() if len(one.effects) < len(best.effects)), key=self.posterior
         )
-        return best if self._is_surely_better(best, smaller) else smaller
+        return self._surely(best, smaller)
+
+    def _surely(self, larger: Hypothesis, smaller: Hypothesis) -> Hypothesis:
+        """A larger set if it is surely better, also than smaller ones that are fitted from its thickness.
+
+        What it brings else is that cells or parameters lie in other minima, which they may without it.
+        """
+        if smaller.effects and self._is_surely_better(larger, smaller):
+            others = [self._from_thickness(smaller, larger)]
+            others += [
+                self._left_out(larger, name)
+                for name in larger.effects
+                if self.catalogue.may_leave((name,), larger.effects)
+            ]
+            smaller = max([smaller, *map(self._keep, others)], key=self.posterior)
+        return larger if self._is_surely_better(larger, smaller) else smaller
+
+    def _from_thickness(self, found: Hypothesis, other: Hypothesis) -> Hypothesis:
+        """A set fitted anew from the thickness of another one."""
+        at = found.point.moved(found.point.levels, other.point.thickness_um)
+        return self._fit(found.effects, found.items, at)
 
     def alike(self, best: Hypothesis) -> Hypothesis:
         """The best set after others of its size were fitted from its thickness, as far as they may be of its class.
@@ -158,8 +119,7 @@ class SetSearch:
         for one in self._of_size(len(best.effects))[: self.rules.refits]:
             behind = self.posterior(best) - self.posterior(one)
             if one is not best and behind < self.rules.refits * self.rules.class_width:
-                at = one.point.moved(one.point.levels, best.point.thickness_um)
-                self._keep(self._fit(one.effects, one.items, at))
+                self._keep(self._from_thickness(one, best))
         return self._of_size(len(best.effects))[0]
 
     def best_so_far(self) -> Hypothesis:
@@ -239,7 +199,7 @@ class SetSearch:
     def _in_orders(self, size: int) -> list[Hypothesis]:
         """All sets of so many effects, the best of them in other fringe orders too where none leaves noise."""
         grown = self._of_size(size)
-        if not grown or self.leaves_noise(grown[0]):
+        if not grown or self.null.point.problem.known or self.leaves_noise(grown[0]):
             return grown
         for found in grown[: self.rules.beam]:
             point, order_um = found.point, found.point.problem.forward.order_um
@@ -275,11 +235,16 @@ class SetSearch:
         known = self.pool.get(frozenset(names))
         if known is not None:
             return known
+        fitted = self._left_out(found, name)
+        return self._keep(fitted) if self.catalogue.may_leave((name,), found.effects) else fitted
+
+    def _left_out(self, found: Hypothesis, name: str) -> Hypothesis:
+        """A fit without one member from where a set is."""
+        names = tuple(one for one in found.effects if one != name)
         items = tuple(item for item in found.items if item.effect != name)
         own = {item.key: item.null for item in found.items if item.effect == name}
         start = jumped(found.point, [i for i in found.items if i.effect == name], list(own.values()))
-        fitted = self._fit(names, items, self._without_keys(start, set(own)))
-        return self._keep(fitted) if self.catalogue.may_leave((name,), found.effects) else fitted
+        return self._fit(names, items, self._without_keys(start, set(own)))
 
     @staticmethod
     def _without_keys(point: Point, keys: set[str]) -> Point:
@@ -367,7 +332,7 @@ class SetSearch:
         """All effects that a set lacks, by what one derivative promises; best first."""
         key = frozenset(base.effects)
         if key not in self._scores:
-            point = base.point
+            point = led(base.point)
             columns = point.level_columns
             if base.items:
                 columns = joined(columns, effect_columns(point, base.items))
@@ -379,8 +344,7 @@ class SetSearch:
                 effect = self.catalogue.effects[name]
                 sought = effect.search.sought or effect.local
                 one = proposed(effect, items, base) if sought else scorer.score(name, items)
-                if one is not None:
-                    found.append(one)
+                found += [one] if one is not None else []
             self._scores[key] = sorted(found, key=lambda one: -one.gain)
             self._joint[key] = scorer.joint()
         return self._scores[key]

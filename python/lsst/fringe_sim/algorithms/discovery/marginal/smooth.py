@@ -32,15 +32,27 @@ def beside_smooth(point: Point) -> tuple[FloatArray, FloatArray]:
     """Score of the thickness of every cell beside a smooth one, and its information alone; each ``(ny, nx)``.
 
     A smooth thickness is that of a plate that is bent. Its stiffness is the likeliest for the thickness about which
-    the problem was made, that of the noise follows from what the plate leaves.
+    the problem was made, that of the noise follows from what the plate leaves. In the place of both stands a
+    thickness that is known, with its error.
     """
     shape = point.problem.forward.geometry.sample_shape
+    if point.problem.known:
+        return beside_known(point)
     none = np.zeros(shape)
     if min(shape) < 3 or not point.problem.data.seen.any():
         return none, none
     weight = _weight(point, point.thickness_um)
     _, score, noise = _plate(shape, weight, point.thickness_um, _stiffness(point.problem))
     return (score / noise).reshape(shape), (weight / noise).reshape(shape)
+
+
+def beside_known(point: Point) -> tuple[FloatArray, FloatArray]:
+    """The same beside the thickness that is known: a fit has followed the data by a part of its error."""
+    problem = point.problem
+    shape, precision = problem.forward.geometry.sample_shape, problem.thickness_sigma_um**-2.0
+    score = (point.thickness_um - problem.thickness_um) * precision
+    followed = np.where(problem.data.seen, 1.0 - point.thickness_sigma_um**2 * precision, 0.0)
+    return score.reshape(shape), (followed.clip(0.0) * precision).reshape(shape)
 
 
 def _weight(point: Point, thickness_um: FloatArray) -> FloatArray:

@@ -25,6 +25,7 @@ from ..preparation import headers_apart
 from ..verdict import Gap, NamedEffect, Verdict
 from ..verdict_words import METRIC, WITHIN_ACCURACY, chance_text, said_of_left_out
 from .accuracy import told_accuracy
+from .catalogue import Catalogue
 from .critics import is_out_of_reach, judge, state_of, total_chance
 from .heldout import Unseen, judge_unseen, rms_unseen
 from .lesson import CellLesson, CellPart, with_corrections
@@ -32,7 +33,7 @@ from .naming import Naming, name_effects
 from .next_flats import FlatForecast
 from .preparation import prepare, prepare_again
 from .rules import Rules
-from .search import Catalogue, SetSearch
+from .search import SetSearch
 from .steps import told_of_steps
 from .telling import data_of, rms_left, size_of, steps_of
 
@@ -327,7 +328,8 @@ class MarginalSearch:
             {"name": one.name, "score": one.fall, "degrees": one.degrees}
             for one in sorted(self.sets.scores(null), key=lambda one: -one.fall)
         ]
-        rounds = [self.sets.best_of(size)[0] for size in range(1, len(found.effects))]
+        # Of sets that fell far behind none is left.
+        rounds = [own[0] for size in range(1, len(found.effects)) if (own := self.sets.best_of(size))]
         steps = steps_of(prepared, [*rounds, found] if found.effects else [], self._leaves_noise)
         return Verdict(
             word, effects,

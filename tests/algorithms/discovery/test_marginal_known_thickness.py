@@ -1,0 +1,109 @@
+"""The search on one likelihood where the thickness was measured: a phase that a free thickness would hide."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from slow_cases import first_is_quick
+
+from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
+from lsst.fringe_sim.algorithms.discovery.marginal.preparation import Prepared, prepare
+from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
+from lsst.fringe_sim.algorithms.inference import coordinates_of, fit, jumped, led
+from lsst.fringe_sim.effects import known_effects
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import FlatExposures, FringeCube
+
+WAVELENGTHS = np.linspace(880.0, 990.0, 8)
+SIDE, PLACES = 32, 3
+ELECTRONS = 20_000.0
+STATED_UM = 0.01
+
+
+def cube_of(
+    rng: np.random.Generator, effects: dict[str, float], stated_um: float = STATED_UM, share: float = 1.0
+) -> FringeCube:
+    """Flats of a small sensor with photon noise and its map, whose errors are a part of those that it states."""
+    y, x = (np.mgrid[: SIDE * PLACES, : SIDE * PLACES] + 0.5 - 0.5 * PLACES) / (SIDE * PLACES)
+    thickness = 15.0 + 0.5 * x + 0.3 * y**2 - 0.2 * x * y
+    model = FringeModel.from_setup("ts8_e2v", effects)
+    flats = model.respond(model.system.flat_fields(WAVELENGTHS, 0.1), thickness, WAVELENGTHS)
+    flats = flats.reshape(8, SIDE, PLACES, SIDE, PLACES).mean(axis=(2, 4))
+    image = rng.poisson(flats * ELECTRONS / flats.mean(axis=(1, 2), keepdims=True)).astype(np.float32)
+    middle = thickness[PLACES // 2 :: PLACES, PLACES // 2 :: PLACES]
+    measured = middle + share * stated_um * rng.standard_normal(middle.shape)
+    rows = FlatExposures(
+        WAVELENGTHS, np.full(8, model.setup.bandwidth_fwhm_nm), np.full(8, model.base_system.temperature_k)
+    )
+    return FringeCube(
+        image,
+        np.maximum(image, 1.0),
+        np.zeros(image.shape, np.int32),
+        rows,
+        "electron",
+        thickness=measured.astype(np.float32),
+        thickness_sigma=np.full(middle.shape, stated_um, np.float32),
+        layer="adhesive",
+    )
+
+
+def prepared_of(cube: FringeCube) -> Prepared:
+    model = FringeModel.from_setup("ts8_e2v")
+    effects = [effect for effect in known_effects(None) if not effect.sky_only]
+    return prepare(cube, model, effects, 20_000, Rules(), np.random.default_rng(5))
+
+
+def verdict_of(cube: FringeCube, core: str = "marginal") -> Verdict:
+    return discover(cube, "ts8_e2v", rng=np.random.default_rng(5), options=SearchOptions(core=core))
+
+
+@pytest.mark.parametrize("share", first_is_quick([0.5, 0.1, 1.0]))
+@pytest.mark.rng("error of a map that is known")
+def test_a_map_has_the_error_that_the_data_show(rng: np.random.Generator, share: float) -> None:
+    prepared = prepared_of(cube_of(rng, {}, share=share))
+    problem = prepared.problem
+    assert problem.known
+    assert np.median(problem.thickness_sigma_um) == pytest.approx(share * STATED_UM, rel=0.2)
+    assert prepared.noise_factor.mean() == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.rng("a phase of a radian and more")
+def test_a_derivative_leads_to_a_phase_that_is_far(rng: np.random.Generator) -> None:
+    """Where the thickness is held half an order beside the data, no derivative does."""
+    prepared = prepared_of(cube_of(rng, {"epoxy_index.offset": 0.012}))
+    point = prepared.point
+    (effect,) = (one for one in known_effects(None) if one.name == "epoxy_index")
+    offset, _ = items = coordinates_of(effect, point.problem.forward)
+    start = led(point)
+    moved = np.median((start.thickness_um - point.problem.thickness_um)[point.problem.data.seen])
+    assert moved == pytest.approx(15.2 * 0.012 / 1.5, rel=0.1)
+    found = fit(("epoxy_index",), items, jumped(point, items, [0.0118, 0.0]))
+    assert found.point.settings[offset.key] == pytest.approx(0.012, abs=2e-4)
+    away = found.point.thickness_um - point.problem.thickness_um
+    assert np.abs(away).max() < 6.0 * STATED_UM  # no cell is in another order
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("effects", "stated_um"),
+    [
+        ({}, 0.002),
+        ({}, 0.03),
+        ({"epoxy_index.offset": 0.005}, STATED_UM),
+        ({"wavelength_offset.offset": 0.4}, 0.002),
+        ({"contrast_loss.factor": 0.9}, 0.002),
+    ],
+    ids=str,
+)
+def test_the_answer_is_that_of_the_present_search(effects: dict[str, float], stated_um: float) -> None:
+    cube = cube_of(np.random.default_rng(list(str(effects).encode())), effects, stated_um)
+    ours, present = verdict_of(cube), verdict_of(cube, "present")
+    assert ours.verdict == present.verdict == ("named" if effects else "no_discrepancy")
+    assert "searched by one likelihood (core marginal)" in ours.notes
+    (hidden,) = {key.partition(".")[0] for key in effects} or {""}
+    for own, other in zip(ours.effects, present.effects, strict=True):
+        assert own.name == other.name
+        assert hidden in (own.name, *own.ambiguous_with)
+        for key, value in own.parameters.items():
+            sigma = np.hypot(value.sigma, other.parameters[key].sigma)
+            assert value.value == pytest.approx(other.parameters[key].value, abs=3.0 * sigma)

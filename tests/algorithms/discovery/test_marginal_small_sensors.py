@@ -1,0 +1,78 @@
+"""The search on one likelihood on sensors that are hardly larger than the blocks that it holds out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
+from lsst.fringe_sim.algorithms.discovery.marginal.noise import OVERLAP
+from lsst.fringe_sim.algorithms.discovery.marginal.preparation import prepare
+from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
+from lsst.fringe_sim.algorithms.discovery.search import MARGINAL_ROWS
+from lsst.fringe_sim.effects import known_effects
+from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import FlatExposures, FringeCube
+
+WAVELENGTHS = np.linspace(880.0, 990.0, 12)
+ELECTRONS, PLACES = 50_000.0, 3
+DIFFERENCES = 115  # Second differences that the largest blocks leave of such a sensor
+STATED = 0.64
+"""Variance that is stated over that of the noise."""
+
+
+def cube_of(rng: np.random.Generator, effects: dict[str, float], stated: float = 1.0) -> FringeCube:
+    """Flats of the smallest sensor that is searched, with photon noise."""
+    side = MARGINAL_ROWS
+    y, x = (np.mgrid[: side * PLACES, : side * PLACES] + 0.5) / (32 * PLACES)
+    thickness = 15.0 + 0.5 * x + 0.3 * y**2 - 0.2 * x * y
+    model = FringeModel.from_setup("ts8_e2v", effects)
+    flats = model.respond(model.system.flat_fields(WAVELENGTHS, 0.1), thickness, WAVELENGTHS)
+    flats = flats.reshape(12, side, PLACES, side, PLACES).mean(axis=(2, 4))
+    image = rng.poisson(flats * ELECTRONS / flats.mean(axis=(1, 2), keepdims=True)).astype(np.float32)
+    width, kelvin = model.setup.bandwidth_fwhm_nm, model.base_system.temperature_k
+    rows = FlatExposures(WAVELENGTHS, np.full(12, width), np.full(12, kelvin))
+    variance = np.float32(stated) * image
+    return FringeCube(image, variance, np.zeros(image.shape, np.int32), rows, "electron")
+
+
+def verdict_of(cube: FringeCube, core: str) -> Verdict:
+    return discover(cube, "ts8_e2v", rng=np.random.default_rng(5), options=SearchOptions(core=core))
+
+
+@pytest.mark.rng("noise of a small sensor")
+def test_noise_is_measured_beside_what_is_held_out(rng: np.random.Generator) -> None:
+    model = FringeModel.from_setup("ts8_e2v")
+    effects = [effect for effect in known_effects(None) if not effect.sky_only]
+    cube = cube_of(rng, {}, STATED)
+
+    def factor_of(rows: int) -> float:
+        part = replace(
+            cube,
+            image=cube.image[:, :rows, :rows],
+            variance=cube.variance[:, :rows, :rows],
+            mask=cube.mask[:, :rows, :rows],
+        )
+        prepared = prepare(part, model, effects, 20_000, Rules(), np.random.default_rng(5))
+        assert prepared.unseen.seen.any()
+        return float(prepared.noise_factor.mean())
+
+    error = np.sqrt(OVERLAP / (2.0 * DIFFERENCES * len(WAVELENGTHS)))
+    assert factor_of(MARGINAL_ROWS) == pytest.approx(STATED**-0.5, rel=4.0 * error)
+    assert factor_of(12) == 1.0  # why fewer rows are left to the present search
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("effects", [{}, {"wavelength_offset.offset": 2.0}], ids=str)
+def test_the_answer_is_that_of_the_present_search(effects: dict[str, float]) -> None:
+    cube = cube_of(np.random.default_rng(list(str(effects).encode())), effects)
+    ours, present = verdict_of(cube, "marginal"), verdict_of(cube, "present")
+    assert "searched by one likelihood (core marginal)" in ours.notes
+    assert ours.verdict == present.verdict == ("named" if effects else "no_discrepancy")
+    for own, other in zip(ours.effects, present.effects, strict=True):
+        assert own.name == other.name
+        for key, value in own.parameters.items():
+            sigma = np.hypot(value.sigma, other.parameters[key].sigma)
+            assert value.value == pytest.approx(other.parameters[key].value, abs=3.0 * sigma)
