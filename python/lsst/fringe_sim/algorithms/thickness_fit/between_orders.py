@@ -74,51 +74,56 @@ def break_price(jump, order):  # type: ignore[no-untyped-def]
     return BREAK_PRICE * min(share * share, 1.0)
 
 
+@subkernel
+def _where_neighbours_have_it(thickness, rise_y, rise_x, y, x, near):  # type: ignore[no-untyped-def]
+    """Write where the up to four neighbours of a cell would have it; their number."""
+    ny, nx = thickness.shape
+    number = 0
+    for side in range(4):
+        b = y - 1 if side == 0 else (y + 1 if side == 1 else y)
+        a = x - 1 if side == 2 else (x + 1 if side == 3 else x)
+        if 0 <= b < ny and 0 <= a < nx and np.isfinite(thickness[b, a]):
+            rise = (rise_y[y, x] + rise_y[b, a]) * (b - y) + (rise_x[y, x] + rise_x[b, a]) * (a - x)
+            near[number] = thickness[b, a] - 0.5 * rise
+            number += 1
+    return number
+
+
+@subkernel
+def _breaks(near, number, thickness, order):  # type: ignore[no-untyped-def]
+    """Price of a thickness beside its neighbours, and the largest jump to one of them."""
+    price, jump = 0.0, 0.0
+    for other in range(number):
+        price += break_price(near[other] - thickness, order)
+        jump = max(jump, abs(near[other] - thickness))
+    return price, jump
+
+
+@subkernel
+def _freedom(weight, x):  # type: ignore[no-untyped-def]
+    """Degrees of freedom of a cell whose thickness is fitted."""
+    number = 0
+    for band in range(weight.shape[1]):
+        number += 1 if weight[x, band] > 0.0 else 0
+    return max(number - 1, 1)
+
+
 @kernel
 def _join_row(  # type: ignore[no-untyped-def]
-    value,
-    weight,
-    table,
-    start,
-    step,
-    thickness,
-    rise_y,
-    rise_x,
-    order,
-    low,
-    high,
-    temper,
-    scale,
-    tail,
-    y,
-    out,
-):
+    value, weight, table, start, step, thickness, rise_y, rise_x, order, low, high, temper, scale, tail, y, out
+):  # fmt: skip
     """Ask the cells of one row that a break parts from a neighbour."""
-    ny, nx = thickness.shape
     top = table.shape[0] - 1.0
     near = np.empty(4, np.float64)
-    for x in range(nx):
+    for x in range(thickness.shape[1]):
         own = thickness[y, x]
         if not np.isfinite(own):
             continue
-        number, price, broken = 0, 0.0, False
-        for side in range(4):
-            b = y - 1 if side == 0 else (y + 1 if side == 1 else y)
-            a = x - 1 if side == 2 else (x + 1 if side == 3 else x)
-            if 0 <= b < ny and 0 <= a < nx and np.isfinite(thickness[b, a]):
-                rise = 0.5 * (rise_y[y, x] + rise_y[b, a]) * (b - y) + 0.5 * (rise_x[y, x] + rise_x[b, a]) * (
-                    a - x
-                )
-                near[number] = thickness[b, a] - rise
-                price += break_price(near[number] - own, order)
-                broken = broken or abs(near[number] - own) > SAME_SURFACE * order
-                number += 1
-        if not broken:
+        number = _where_neighbours_have_it(thickness, rise_y, rise_x, y, x, near)
+        price, jump = _breaks(near, number, own, order)
+        if jump <= SAME_SURFACE * order:
             continue
-        freedom = 0
-        for band in range(weight.shape[1]):
-            freedom += 1 if weight[x, band] > 0.0 else 0
-        freedom = max(freedom - 1, 1)
+        freedom = _freedom(weight, x)
         place = min(max((own - start) / step, 0.0), top)
         _, _, chi2 = gauss_newton(table, place, value, weight, x, np.int64(3), 0.03 / step)
         least = temper * improbability(chi2, freedom, scale, tail) + price
@@ -128,8 +133,6 @@ def _join_row(  # type: ignore[no-untyped-def]
             found = start + step * place
             if abs(found - near[asked]) > SAME_SURFACE * order or not low <= found <= high:
                 continue
-            cost = temper * improbability(chi2, freedom, scale, tail)
-            for other in range(number):
-                cost += break_price(near[other] - found, order)
+            cost = temper * improbability(chi2, freedom, scale, tail) + _breaks(near, number, found, order)[0]
             if cost < least - 1e-3:
                 least, out[x] = cost, found
