@@ -1,11 +1,12 @@
 """Size of every room: what a reader must read, beside another revision if one is named.
 
-python scripts/sizes.py [--of REV] [--against REV] [--long]
+python scripts/sizes.py [--of REV] [--against REV] [--long] [--abilities]
 """
 
 import argparse
 import ast
 import io
+import re
 import subprocess
 import tarfile
 from collections import defaultdict
@@ -14,9 +15,30 @@ from pathlib import Path, PurePosixPath
 
 TOP = Path(__file__).parents[1]
 PACKAGE = PurePosixPath("python/lsst/fringe_sim")
-LONG_BODY, MANY_ARGUMENTS, LONG_MODULE = 40, 8, 450
+SEARCH = "algorithms/discovery"
+LONG_BODY, MANY_ARGUMENTS, MANY_IN_A_KERNEL, LONG_MODULE = 40, 8, 12, 450
 # Our two decorators, and those of numba.
 COMPILED = {"kernel", "subkernel", "njit", "jit", "vectorize", "guvectorize"}
+# Abilities by the files that brought them; a new file that no pattern names holds what others did before.
+ABILITIES = {
+    "correction of observed frames, templates from them, sky shift (44)": (
+        r"/correction|cli/correct|observed_|/coadd_sources|fit_sky|sky_shift|map_(on_sky|from_range)|range_|"
+        r"night_(sums|levels)|templates|afw_background|image_archive|visit|sky_of_maps|smooth_field|sky_frames"
+    ),
+    "evidence of all public data; diffuse gate side, OH by levels, beam by field (43)": (
+        r"evidence|continua|oh_levels|optics/diffuse|laboratory_shift|beam_field|mock/silicon_tables|ray_bundle|"
+        r"sky_model_error|flat_spectrum"
+    ),
+    "demo, arrays and notebooks, sensors from YAML, spectra, compiling beforehand (46)": (
+        r"notebook|demo_|plain_flats|galsim_config|model/spectrum|descriptions|deprecation|warm_up|cli/compile|"
+        r"cli/command|bad_files|stated_facts|source_figure"
+    ),
+    "thickness fit under misfit, its forecast and its words (41)": (
+        r"thickness_fit/(?!silicon|bands|solver)|flat_fit|flat_conditions"
+    ),
+    "one likelihood outside the search; learned effects (45)": r"/inference/|learned",
+    "checks of what comes from outside (42)": r"raw_checks|raw_times|same_light|flat_exposures|file_keywords",
+}
 FunctionNode = ast.FunctionDef | ast.AsyncFunctionDef
 
 
@@ -42,7 +64,7 @@ TITLES = {
     "docstrings": "lines of docstrings",
     "compiled": "compiled",
     "long": f"bodies > {LONG_BODY}",
-    "wide": f"arguments > {MANY_ARGUMENTS}",
+    "wide": f"arguments > {MANY_ARGUMENTS} (compiled > {MANY_IN_A_KERNEL})",
     "modules": f"modules > {LONG_MODULE}",
 }
 
@@ -125,7 +147,8 @@ def measure(text: str) -> tuple[Size, list[tuple[int, int, str]]]:
         names = decorator_names(node)
         long, count = body_lines(node), arguments(node)
         # The arguments of a command are its options.
-        wide = count > MANY_ARGUMENTS and not names & {"command", "option", "argument"}
+        most = MANY_IN_A_KERNEL if names & COMPILED else MANY_ARGUMENTS
+        wide = count > most and not names & {"command", "option", "argument"}
         size += Size(compiled=int(bool(names & COMPILED)), long=int(long > LONG_BODY), wide=int(wide))
         if long > LONG_BODY or wide:
             notable.append((long, count, node.name))
@@ -160,7 +183,7 @@ def table(now: dict[str, Size], before: dict[str, Size] | None) -> str:
 
     rooms = sorted(set(now) | set(before or {}))
     package = [room for room in rooms if room != "tests"]
-    search = [room for room in package if room.startswith("algorithms/discovery")]
+    search = [room for room in package if room.startswith(SEARCH)]
     lines = ["| room | " + " | ".join(TITLES.values()) + " |", "|---|" + "--:|" * len(TITLES)]
     lines += [row(room, [room]) for room in package]
     lines.append(row("**package without the search**", [room for room in package if room not in search]))
@@ -169,13 +192,37 @@ def table(now: dict[str, Size], before: dict[str, Size] | None) -> str:
     return "\n".join(lines)
 
 
+def abilities(now: str | None, before: str) -> str:
+    """Markdown table of the lines, outside the search, of files that are not in an older revision."""
+    command = ["git", "-C", str(TOP), "diff", "-M30%", "--diff-filter=A", "--name-only", before]
+    command += [now] if now else []
+    listed = subprocess.run([*command, "--", "python"], check=True, capture_output=True, text=True).stdout
+    texts = {str(path): text for path, text in sources(now).items() if not room_of(path).startswith(SEARCH)}
+    added = {path: texts[path].count("\n") for path in listed.split() if path in texts}
+    whole = sum(text.count("\n") for path, text in texts.items() if path.startswith("python"))
+    rows, left = [("package without the search", whole)], dict(added)
+    for name, pattern in ABILITIES.items():
+        rows.append((name, -sum(left.pop(path) for path in list(left) if re.search(pattern, path))))
+    rows.append(("**at the same abilities, at most**", sum(number for _, number in rows)))
+    rows.append(("of these in new files", sum(left.values())))
+    return "\n".join(
+        ["| what | lines |", "|---|--:|", *(f"| {name} | {number:,} |" for name, number in rows)]
+    )
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--of", metavar="REV", help="revision to measure (default: the work tree)")
     parser.add_argument("--against", metavar="REV", help="revision to compare with")
     parser.add_argument("--long", action="store_true", help="name what is too long or too wide")
+    parser.add_argument(
+        "--abilities", action="store_true", help="what new files since --against hold, instead"
+    )
     options = parser.parse_args()
+    if options.abilities:
+        print(abilities(options.of, options.against or parser.error("--abilities needs --against")))
+        return
     now = per_room(options.of, options.long)
     print(table(now, per_room(options.against) if options.against else None))
 

@@ -1,7 +1,9 @@
 """Fixtures shared by all tests."""
 
+import logging
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +27,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="K/N",
         help="run the K-th of N parts of the suite",
     )
+    parser.addoption("--backwards", action="store_true", help="run the last test first")
     parser.addoption("--record-numbers", action="store_true", help="write tests/records anew")
 
 
@@ -34,6 +37,26 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if share.has(group_of(item))]
+    if config.getoption("--backwards"):
+        items.reverse()
+
+
+LEVEL = logging.getLogger().level
+
+
+@pytest.fixture(autouse=True)
+def _log_of_a_new_process() -> Iterator[None]:
+    """A command sets the level and the stream of the log for its process: not for the tests that come after it."""
+    _forget_log()
+    yield
+    _forget_log()
+
+
+def _forget_log() -> None:
+    root = logging.getLogger()
+    root.setLevel(LEVEL)
+    for handler in [item for item in root.handlers if type(item) is logging.StreamHandler]:
+        root.removeHandler(handler)
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,7 @@ from lsst.fringe_sim.style import (
     BAD_GREY,
     block_mean,
     color_bar,
+    draw_image,
     figure,
     finite_range,
     map_to_png,
@@ -103,9 +104,7 @@ def test_an_image_stands_in_pixels_of_the_sensor() -> None:
         axes = made.subplots()
         mask = np.zeros(values.shape, int)
         mask[2, 3] = 2
-        drawn = show_image(
-            axes, values, label="", mask=mask, diverging=True, limits=(-1.0, 2.0), colorbar=False
-        )
+        drawn = draw_image(axes, values, mask=mask, diverging=True, limits=(-1.0, 2.0))
         assert np.flatnonzero(
             drawn.get_array().mask if np.ma.isMaskedArray(drawn.get_array()) else 0
         ).tolist() == [43]

@@ -14,7 +14,7 @@ from lsst.fringe_sim.algorithms.sky_response import sky_response
 from lsst.fringe_sim.cli.inputs import placed_model
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.instrument.sky import SkySpectrum
-from lsst.fringe_sim.mock.visits import write_mock_visits
+from lsst.fringe_sim.mock.visits import VisitConditions, write_mock_visits
 from lsst.fringe_sim.model import Setup
 from lsst.fringe_sim.products.observed_files import observed_images
 
@@ -61,9 +61,8 @@ def one_sensor(setup, name, rng, folder):
         setup=setup,
         detector=name,
         thickness_um=thickness,
-        visits=VISITS,
         rng=rng,
-        size=f"{SIDE}x{SIDE}",
+        conditions=VisitConditions(VISITS),
     )
     for visit in visits:
         frame = observed_images(visit.path)[0].read()

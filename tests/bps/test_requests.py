@@ -1,12 +1,13 @@
 """What the shipped site files ask a cluster for, beside what was measured, and the plan of a whole focal plane."""
 
 import datetime
+import os
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from lsst.ctrl.bps import BPS_DEFAULTS, BpsConfig
+from lsst.ctrl.bps import BPS_DEFAULTS, BpsConfig, initialize
 from lsst.ctrl.bps.drivers import transform_driver
 from lsst.daf.butler import Butler, Config
 from lsst.resources import ResourcePath
@@ -74,6 +75,8 @@ def test_the_whole_focal_plane_is_planned(tmp_path: Path, monkeypatch: pytest.Mo
     for name in ("CTRL_MPEXEC_DIR", "DAF_BUTLER_DIR"):
         monkeypatch.setenv(name, "set for the test")
         monkeypatch.delenv(name)
+    monkeypatch.setenv("PATH", os.environ["PATH"])
+    monkeypatch.setattr(initialize, "shutil", initialize.shutil)
     from lsst.fringe_sim.middleware.bps_environment import accept_resources, point_to_this_environment
 
     point_to_this_environment()

@@ -132,6 +132,30 @@ def test_units_that_do_not_fit_are_usage_errors(text: str) -> None:
         EFFECT.convert(text, None, None)
 
 
+def given_as_pairs() -> list[tuple[str, click.Parameter]]:
+    """Parameters of all commands that take two things joined by ``=``."""
+    return [(name, item) for name in COMMANDS for item in command(name).params if "=" in item.type.name]
+
+
+@pytest.mark.parametrize("text", ["", "=", "R11_S01", "bandwidth.fwhm", "=1", "R11_S01=", "bandwidth.fwhm="])
+def test_a_pair_without_one_of_its_parts_is_a_usage_error(text: str) -> None:
+    """Of every command; the message says what was given and what is wanted."""
+    pairs = given_as_pairs()
+    assert {"--effect", "--thickness"} <= {option for _, item in pairs for option in item.opts}
+    for name, item in pairs:
+        with pytest.raises(click.BadParameter) as refused:
+            item.type.convert(text, item, click.Context(command(name)))
+        assert repr(text) in refused.value.message or repr(text.partition("=")[2]) in refused.value.message
+
+
+def test_the_name_of_a_pair_ends_at_its_first_sign() -> None:
+    """A file may have such a sign in its name."""
+    (item,) = (item for name, item in given_as_pairs() if name == "focal-plane")
+    found = item.type.convert("R11_S01=a=b.fits", item, None)
+    assert (found.name, found.path) == ("R11_S01", Path("a=b.fits"))
+    assert item.type.convert(found, item, None) == found
+
+
 def test_negative_temperatures_are_no_options(tmp_path: Path, capsys) -> None:
     arguments = ["mock-flats", str(tmp_path / "raws"), "--size", "64x64", "--seed", "1", "--dry-run"]
     assert run([*arguments, "--temperature", "-100degC"]) == 0

@@ -81,6 +81,11 @@ def test_cost_grows_with_sensors_and_exposures() -> None:
         (["--sensor", "R44_SG0"], "a science sensor"),
         (["--sensor", "R99_S00"], "R99_S00"),
         (["--thickness", "R22_S11=missing.fits"], "an existing FITS file"),
+        (
+            ["--sensor", "R22_S11", "--thickness", f"R22_S12={__file__}"],
+            "a science sensor that --sensor chooses",
+        ),
+        (["--thickness", f"R22_S11={__file__}", "--thickness", f"R22_S11={__file__}"], "one map of a sensor"),
     ],
 )
 def test_bad_input_is_named(arguments, message, tmp_path, capsys) -> None:
@@ -96,8 +101,10 @@ def test_effects_that_a_set_up_cannot_have_are_left_out(capsys) -> None:
     assert err.startswith("lsst_itl: without bandwidth.fwhm (")
 
 
-def test_a_map_without_its_sensor_is_a_usage_error(tmp_path) -> None:
-    assert run(["focal-plane", "--thickness", "thickness.fits", "--out", str(tmp_path / "out")]) == 2
+@pytest.mark.parametrize("text", ["thickness.fits", "=thickness.fits", "R22_S11="])
+def test_a_map_without_its_sensor_is_a_usage_error(text, tmp_path, capsys) -> None:
+    assert run(["focal-plane", "--thickness", text, "--out", str(tmp_path / "out")]) == 2
+    assert f"'{text}' is not SENSOR=FILE" in capsys.readouterr().err
 
 
 def test_amplitudes_names_what_it_would_compute(tmp_path, capsys) -> None:

@@ -36,23 +36,30 @@ def bright_sky(count: int = 20, airmass: float = 1.2) -> SkySpectrum:
 
 
 def sky_frames_of(
-    setup: str, settings: Mapping[str, float], seed: int, level: float = 4e6
+    setup: str,
+    settings: Mapping[str, float],
+    seed: int,
+    level: float = 4e6,
+    *,
+    shape: tuple[int, int] = SHAPE,
+    span: float = 2.5,
+    sky: SkySpectrum | None = None,
 ) -> tuple[list[SkyFringe], np.ndarray]:
     """Frames of a night with photon noise, and the map of their sensor at the centres of the pixels."""
     rng = np.random.default_rng(seed)
     model = FringeModel.from_setup(setup, settings)
-    fine = random_field((FINER * SHAPE[0], FINER * SHAPE[1]), rng, mean=14.0, span=2.5)
+    fine = random_field((FINER * shape[0], FINER * shape[1]), rng, mean=14.0, span=span)
     truth = fine[FINER // 2 :: FINER, FINER // 2 :: FINER]
-    sky = SkySpectrum.dark(airmass=model.setup.airmass)
+    sky = sky or SkySpectrum.dark(airmass=model.setup.airmass)
     response = sky_response(model, sky, thickness_range_um=(float(fine.min()) - 0.1, float(fine.max()) + 0.1))
     night, frames = NightHistory.guo2022(), []
     for time in range(FRAMES):
         scale = night.band_scale(3 * time, response.bands)
         frame = simulate_sky_frame(fine, model, response=response, scale=scale, mean_electrons=level)
         # Pixels average the light over their area.
-        light = frame.image.reshape(SHAPE[0], FINER, SHAPE[1], FINER).mean(axis=(1, 3), dtype=np.float64)
+        light = frame.image.reshape(shape[0], FINER, shape[1], FINER).mean(axis=(1, 3), dtype=np.float64)
         image = add_exposure_noise(light.astype(np.float32), np.random.default_rng(seed + 10 * time), 0.0)
         cards = {**frame.metadata, "NOISE": True, **band_cards(scale)}
-        mask = np.zeros(SHAPE, dtype=frame.mask.dtype)
+        mask = np.zeros(shape, dtype=frame.mask.dtype)
         frames.append(replace(frame, image=image, mask=mask, seed=seed + 10 * time, metadata=cards))
-    return frames, truth + 0.002 * rng.standard_normal(SHAPE)
+    return frames, truth + 0.002 * rng.standard_normal(shape)

@@ -7,6 +7,7 @@ import numpy as np
 from astropy.table import Table
 from product_makers import sky, templates
 
+from lsst.fringe_sim.algorithms.coadd_sources import NightResults
 from lsst.fringe_sim.algorithms.correction.quality import FrameProof
 from lsst.fringe_sim.algorithms.discovery.verdict import (
     Gap,
@@ -129,6 +130,8 @@ def challenge(folder: Path, origin: Origin) -> Path:
     return write_challenge_report(folder / "challenge.html", ChallengeResult(7, (case,)), origin)
 
 
+NIGHT = [sky((64, 64), number, mask=np.zeros((64, 64), np.int32)) for number in (1, 2)]
+
 SMALL_PAGES: dict[str, Callable[[Path, Origin], Path]] = {
     "thickness": thickness_page,
     "discovery": lambda folder, origin: discovery_page(verdict(), origin=origin).write(
@@ -136,9 +139,9 @@ SMALL_PAGES: dict[str, Callable[[Path, Origin], Path]] = {
     ),
     "sky": lambda folder, origin: write_sky_report(
         folder / "report.html",
-        [sky((64, 64), number, mask=np.zeros((64, 64), np.int32)) for number in (1, 2)],
+        NIGHT,
         "lsst_e2v",
-        1,
+        NightResults.of(NIGHT, 1),
         picture=folder / "sky.png",
         origin=origin,
     ),

@@ -52,7 +52,9 @@ def htcondor(monkeypatch: pytest.MonkeyPatch) -> None:
     module = types.ModuleType("lsst.ctrl.bps.htcondor")
     module.HTCondorService = type("HTCondorService", (BaseWmsService,), {})  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "lsst.ctrl.bps.htcondor", module)
-    monkeypatch.delitem(sys.modules, "lsst.fringe_sim.middleware.bps_htcondor", raising=False)
+    # Both, so that what is imported with the stand-in ends with the test.
+    monkeypatch.setitem(sys.modules, "lsst.fringe_sim.middleware.bps_htcondor", module)
+    monkeypatch.delitem(sys.modules, "lsst.fringe_sim.middleware.bps_htcondor")
 
 
 # Site files

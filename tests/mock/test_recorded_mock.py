@@ -113,9 +113,8 @@ def test_files_of_two_visits(tmp_path: Path, recorded: Record) -> None:
         setup="lsst_e2v",
         detector="R22_S11",
         thickness_um=np.linspace(15.0, 15.03, 32 * 16).reshape(16, 32),
-        visits=2,
         rng=np.random.default_rng(12),
-        size="32x16",
+        conditions=VisitConditions(2),
     )
     recorded({"visits": list(made), "folder": tmp_path})
 

@@ -85,7 +85,7 @@ def test_places_on_the_sky_are_those_of_the_header(rng) -> None:
 @pytest.mark.rng("visits: visits are read")
 def test_visits_are_read_and_tell_nothing(tmp_path, rng) -> None:
     thickness = random_field(SHAPE, rng, mean=16.0, span=1.0, scale=25.0)
-    night = {"setup": "lsst_e2v", "detector": "R22_S11", "visits": 2, "size": "64x64"}
+    night = {"setup": "lsst_e2v", "detector": "R22_S11", "conditions": VisitConditions(2)}
     made = list(write_mock_visits(tmp_path, thickness_um=thickness, rng=rng, **night))
     for visit in made:
         (image,) = observed_images(visit.path)
@@ -130,6 +130,16 @@ def test_a_night_that_cannot_be_drawn_is_refused_before_work(old, new, more, sai
 def test_a_laboratory_has_no_sky() -> None:
     with pytest.raises(InputError, match="telescope"):
         detected_sky("ts8_e2v", _sensor(), np.full((2, 2), 15.0))
+
+
+@pytest.mark.rng("maps that are no sensor")
+@pytest.mark.parametrize("shape", [(64,), (64, 60), (2, 64, 64)])
+def test_a_map_that_is_no_sensor_is_refused(shape, rng, tmp_path) -> None:
+    with pytest.raises(InputError, match=r"rows.* and .*columns"):
+        write_mock_visits(
+            tmp_path, setup="lsst_e2v", detector="R22_S11", thickness_um=np.full(shape, 15.0), rng=rng
+        )
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.slow

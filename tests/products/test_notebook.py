@@ -57,3 +57,14 @@ def test_what_is_shown_is_no_markup() -> None:
     counts = np.full((1, 2, 2), 1e4)
     cube = FringeCube.from_arrays(counts, [950.0], detector="<b>x</b>")
     assert "<b>x</b>" not in cube._repr_html_()
+
+
+def test_templates_are_drawn_in_parts_of_the_sky_or_in_the_unit_of_the_frames() -> None:
+    """Frames without their sky say nothing of parts of it."""
+    for per_sky, factor in ((True, 100.0), (False, 1.0)):
+        product = MAKERS["FringeTemplates"](metadata={"PERSKY": per_sky})
+        image = product.plot().images[0]
+        good = product.mask == 0
+        found = np.ma.filled(np.ma.asarray(image.get_array(), dtype=float), np.nan)[good]
+        np.testing.assert_allclose(found, factor * product.patterns[0][good], rtol=1e-5)
+        pyplot.close("all")

@@ -4,9 +4,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from astropy.table import Table
 
+from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.report.correction_page import frame_figure
 from lsst.fringe_sim.report.discovery_figures import where_figure
+from lsst.fringe_sim.report.focal_plane_page import focal_plane_figure
 from lsst.fringe_sim.style import figure, panels, show_image, to_png
 
 
@@ -30,6 +33,31 @@ def test_large_offsets_of_amplifiers_stay_inside_their_boxes() -> None:
     said = [text.get_text().partition("\n")[2] for text in axes.texts]
     assert "sixteenth" in axes.get_title()  # a sensor may have other amplifiers than these
     assert said == ["+0.3", "-34.5", "+601"]
+
+
+@pytest.mark.parametrize(("largest", "scale"), [(29.0, "linear"), (3000.0, "symlog")])
+def test_wavelengths_of_any_misfit_have_visible_bars(largest: float, scale: str) -> None:
+    """Where one wavelength is a thousand times worse than noise, the others are still to be seen."""
+    rows = [
+        {"wavelength_nm": 900.0 + 10.0 * number, "chi2": 50.0 * value, "degrees": 50.0}
+        for number, value in enumerate((1.0, 2.0, largest))
+    ]
+    where = SimpleNamespace(amplifier=[], wavelength=rows, thickness_phase=[], channels=[])
+    made = where_figure(SimpleNamespace(where=where))  # type: ignore[arg-type]
+    axes = made.axes[0]
+    assert axes.get_yscale() == scale
+    np.testing.assert_allclose([bar.get_height() for bar in axes.patches], [1.0, 2.0, largest])
+    bottom, top = axes.get_ylim()
+    assert (bottom, top > largest) == (0.0, True)
+    heights = [axes.transData.transform((900.0, value))[1] for value in (0.0, 1.0, top)]
+    assert heights[1] - heights[0] > 0.02 * (heights[2] - heights[0])
+
+
+def test_a_focal_plane_without_cells_is_refused() -> None:
+    names = ("detector", "x", "y", "rms", "rms_brightness", "over_noise", "residual_over_noise")
+    cells = Table({name: np.zeros(0, "U7" if name == "detector" else float) for name in names})
+    with pytest.raises(InputError, match=r"focal plane.*one sensor or more"):
+        focal_plane_figure(cells, Table({"detector": np.zeros(0, "U7"), "field_radius": np.zeros(0)}))
 
 
 @pytest.mark.parametrize("layout", ["constrained", None])

@@ -16,6 +16,7 @@ from recorded_numbers import Record, Words
 from seen_pages import drawn
 from small_pages import WAVELENGTHS_NM, frame, smooth_map, verdict
 
+from lsst.fringe_sim.algorithms.coadd_sources import NightResults
 from lsst.fringe_sim.algorithms.coadds import Coadds
 from lsst.fringe_sim.algorithms.correction.injection import Measured, injection_table
 from lsst.fringe_sim.algorithms.discovery import Verdict
@@ -97,9 +98,8 @@ def sky_page(folder: Path) -> Path:
         frames.append(
             SkyFringe(image.astype(np.float32), mask, "electron", level, 30.0, 1.2, hour, None, 1e-8)
         )
-    return write_sky_report(
-        folder / "sky.html", frames, "lsst_e2v", 1, picture=folder / "sky.png", pixel_arcsec=0.5
-    )
+    results = NightResults.of(frames, 1, pixel_arcsec=0.5)
+    return write_sky_report(folder / "sky.html", frames, "lsst_e2v", results, picture=folder / "sky.png")
 
 
 def correction_page(folder: Path) -> Path:

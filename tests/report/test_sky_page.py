@@ -1,11 +1,13 @@
 """The page of simulated sky frames."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from browser import check_page
 
+from lsst.fringe_sim.algorithms.coadd_sources import NightResults
 from lsst.fringe_sim.algorithms.fringe_amplitudes import fringe_amplitudes
 from lsst.fringe_sim.products import SkyFringe
 from lsst.fringe_sim.report.figures import residuals_figure
@@ -30,6 +32,10 @@ def night(shape: tuple[int, int] = (150, 160), hours: int = 3) -> list[SkyFringe
     return made
 
 
+def sky_page(path: Path, frames: list[SkyFringe]) -> Path:
+    return write_sky_report(path, frames, "lsst_e2v", NightResults.of(frames, 1))
+
+
 def test_amplitudes_are_those_of_the_frames() -> None:
     frames = night()
     table = sky_amplitudes(frames)
@@ -42,11 +48,11 @@ def test_amplitudes_are_those_of_the_frames() -> None:
 
 def test_page_of_a_night_in_a_browser(tmp_path) -> None:
     """With components and coadds; a single frame with noise has neither."""
-    path = write_sky_report(tmp_path / "night.html", night(), "lsst_e2v", 1)
+    path = sky_page(tmp_path / "night.html", night())
     text = path.read_text(encoding="utf-8")
     for words in ("Components", "Coadds", "coadds.ecsv", "sky_fringe_amplitudes.ecsv"):
         assert words in text
-    alone = write_sky_report(tmp_path / "one.html", night(hours=1), "lsst_e2v", 1).read_text(encoding="utf-8")
+    alone = sky_page(tmp_path / "one.html", night(hours=1)).read_text(encoding="utf-8")
     assert "Components" not in alone
     assert "Coadds" in alone
     check_page(path, tmp_path, 390, "sky_390")
@@ -84,6 +90,6 @@ def test_residuals_are_on_the_scale_of_the_noise_of_their_means(rng) -> None:
 def test_what_a_table_with_noise_shows_is_said(tmp_path) -> None:
     """The summary has the fringes alone."""
     quiet, said = night(hours=1), "noise included"
-    assert said not in write_sky_report(tmp_path / "a.html", quiet, "lsst_e2v", 1).read_text("utf-8")
+    assert said not in sky_page(tmp_path / "a.html", quiet).read_text("utf-8")
     noisy = [replace(frame, seed=1, metadata={"FRINGRMS": 0.002, "FRING198": 0.003}) for frame in quiet]
-    assert said in write_sky_report(tmp_path / "b.html", noisy, "lsst_e2v", 1).read_text("utf-8")
+    assert said in sky_page(tmp_path / "b.html", noisy).read_text("utf-8")

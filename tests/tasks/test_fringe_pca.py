@@ -91,6 +91,30 @@ def test_one_frame_is_refused() -> None:
         run(frames(1))
 
 
+def test_an_exposure_that_is_there_twice_is_refused() -> None:
+    """Noise is never the same twice, so that frames of equal pixels with noise are one exposure."""
+    noisy = frames(seed=1)
+    with pytest.raises(InputError, match="sky frames is 'equal pixels in 1 and 6'"):
+        run([*noisy, noisy[1]])
+
+
+def test_equal_hours_of_two_nights_count_twice_where_there_is_no_noise() -> None:
+    """The template is the mean of all frames over their levels, the copy among them."""
+    given = [*frames(), frames()[1]]
+    fringe = run(given).fringe
+    good = given[0].mask == 0
+    relative = np.array([frame.image[good] / frame.image[good].mean(dtype=float) - 1.0 for frame in given])
+    assert np.corrcoef(fringe.image[good], relative.mean(axis=0))[0, 1] > 1.0 - 1e-6
+    assert run(given).components.metadata["NFRAMES"] == 7
+
+
+@pytest.mark.parametrize("seed", [None, 1])
+def test_frames_that_are_all_alike_are_refused(seed: int | None) -> None:
+    """Even without noise: nothing varies, so that nothing tells the fringes."""
+    with pytest.raises(InputError, match=r"equal pixels|no differences"):
+        run([frames(1, seed=seed)[0]] * 3)
+
+
 def test_the_template_can_be_registered_as_afw_wants_it() -> None:
     own = FringePcaConnections(config=FringePcaConfig())
     afw = FringePcaConnections(config=FringePcaConfig(fringeStorageClass="ExposureF"))

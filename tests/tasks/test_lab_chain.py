@@ -82,6 +82,23 @@ def first_run(
     return repo, run_lab(command, repo, "u/lab", "-C", f"epoxyFit:{rafts_file}")
 
 
+@pytest.fixture(scope="module")
+def second_run(
+    command: Command,
+    first_run: tuple[Path, Outcome],
+    spoiled: tuple[Path, Path, Path],
+    rafts_file: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[Path, Outcome]:
+    """Another repository, in which the frame was sent again and what had failed has run again."""
+    repo = Path(shutil.copytree(first_run[0], tmp_path_factory.mktemp("lab") / "repo"))
+    _, dark, flat = spoiled
+    shutil.copyfile(flat, dark)
+    return repo, run_lab(
+        command, repo, "u/lab", "-C", f"epoxyFit:{rafts_file}", "--skip-existing-in", "u/lab"
+    )
+
+
 def fitted(repo: Path, collection: str) -> set[int]:
     with Butler.from_config(str(repo)) as butler:
         refs = butler.query_datasets("epoxyThickness", collections=collection, explain=False)
@@ -145,13 +162,8 @@ def test_one_command_tells_what_a_dataset_was_made_from(
     assert {item["here"] for item in record["tables"]} == {"same"}
 
 
-def test_only_what_failed_runs_again(
-    command: Command, first_run: tuple[Path, Outcome], spoiled: tuple[Path, Path, Path], rafts_file: Path
-) -> None:
-    repo, _ = first_run
-    _, dark, flat = spoiled
-    shutil.copyfile(flat, dark)  # the frame is sent again
-    outcome = run_lab(command, repo, "u/lab", "-C", f"epoxyFit:{rafts_file}", "--skip-existing-in", "u/lab")
+def test_only_what_failed_runs_again(second_run: tuple[Path, Outcome]) -> None:
+    repo, outcome = second_run
     assert outcome.code == 0, outcome.text
     assert "Executed 2 quanta successfully, 0 failed and 0 remain" in outcome.text
     assert fitted(repo, "u/lab") == set(DETECTORS.values())
@@ -193,9 +205,9 @@ def complete(repo: Path, run: str) -> int:
 
 
 def test_a_killed_fit_loses_only_the_sensor_it_was_in(
-    command: Command, first_run: tuple[Path, Outcome]
+    command: Command, second_run: tuple[Path, Outcome]
 ) -> None:
-    repo, _ = first_run
+    repo, _ = second_run
     for number in range(5):
         out = f"u/killed{number}"
         killed_after_one_map(repo, out)
@@ -221,8 +233,8 @@ def test_a_killed_fit_loses_only_the_sensor_it_was_in(
         assert (butler.get("epoxyThickness", detector=kept).mask == 0).mean() > 0.85
 
 
-def test_override_of_one_raft_within_a_run_of_all(first_run: tuple[Path, Outcome]) -> None:
-    repo, _ = first_run
+def test_override_of_one_raft_within_a_run_of_all(second_run: tuple[Path, Outcome]) -> None:
+    repo, _ = second_run
     with Butler.from_config(str(repo), collections="u/lab", instrument="LSST-TS8") as butler:
         own = butler.get("epoxyThickness", detector=DETECTORS["RTM-020_S01"]).metadata
         other = butler.get("epoxyThickness", detector=DETECTORS["RTM-006_S11"]).metadata
@@ -230,8 +242,8 @@ def test_override_of_one_raft_within_a_run_of_all(first_run: tuple[Path, Outcome
     assert "EFFECT0" not in other
 
 
-def test_override_of_one_raft_in_a_run_of_its_own(command: Command, first_run: tuple[Path, Outcome]) -> None:
-    repo, _ = first_run
+def test_override_of_one_raft_in_a_run_of_its_own(command: Command, second_run: tuple[Path, Outcome]) -> None:
+    repo, _ = second_run
     file = Path(__file__).parents[2] / "config" / "ts8" / "rafts" / "RTM-020.py"
     outcome = run_lab(
         command,
@@ -250,9 +262,9 @@ def test_override_of_one_raft_in_a_run_of_its_own(command: Command, first_run: t
     assert fitted(repo, run) == {DETECTORS["RTM-020_S01"]}
 
 
-def test_from_the_stand_to_the_sky(command: Command, first_run: tuple[Path, Outcome]) -> None:
+def test_from_the_stand_to_the_sky(command: Command, second_run: tuple[Path, Outcome]) -> None:
     """The camera adopts the map; its sky frames and template follow."""
-    repo, _ = first_run
+    repo, _ = second_run
     with Butler.from_config(str(repo), writeable=True) as butler:
         define_night(butler, "LSSTCam", [NightPlan(datetime.date(2026, 1, 15), (20.0, 23.0))])
     adopted = command(

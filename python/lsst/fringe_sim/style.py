@@ -105,16 +105,21 @@ def finite_range(
     return (low, high) if high > low else (low - around, high + around)
 
 
-def show_image(
+def show_image(axes: Axes, image: NDArray[Any], *, label: str, title: str = "", **drawn: Any) -> AxesImage:
+    """Draw an image in detector coordinates beside a colour bar; further arguments are those of `draw_image`."""
+    shown = draw_image(axes, image, **drawn)
+    axes.set_title(title, y=TITLE_PLACE)
+    color_bar(axes, shown, label)
+    return shown
+
+
+def draw_image(
     axes: Axes,
     image: NDArray[Any],
     *,
-    label: str,
-    title: str = "",
     mask: NDArray[Any] | None = None,
     diverging: bool = False,
     limits: tuple[float, float] | None = None,
-    colorbar: bool = True,
     step_px: float = 1.0,
     most_px: int = MOST_PIXELS,
 ) -> AxesImage:
@@ -133,10 +138,7 @@ def show_image(
     drawn = axes.imshow(
         thin, cmap=cmap, vmin=low, vmax=high, extent=(-0.5, nx - 0.5, -0.5, ny - 0.5), aspect="equal"
     )
-    axes.set_title(title, y=TITLE_PLACE)
     axes.set(xlabel="column [px]", ylabel="row [px]")
-    if colorbar:
-        color_bar(axes, drawn, label)
     return drawn
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
-from lsst.fringe_sim.algorithms.discovery.marginal.preparation import Prepared, prepare
+from lsst.fringe_sim.algorithms.discovery.marginal.preparation import Prepared, _in_parts, prepare
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
+from lsst.fringe_sim.algorithms.inference import CellShape
 from lsst.fringe_sim.effects import known_effects
 from lsst.fringe_sim.errors import UnknownNameError
 from lsst.fringe_sim.model import FringeModel
@@ -123,3 +125,31 @@ def test_pixels_see_a_point_or_their_area_by_the_likelihood(places: int, rng: np
 def test_another_core_is_refused() -> None:
     with pytest.raises(UnknownNameError, match="core"):
         SearchOptions(core="newest")
+
+
+def test_the_thickness_of_larger_cells_is_continued_within_them() -> None:
+    """A surface of second degree is the same in cells of two pixels as in those of six."""
+
+    def surface(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return 14.0 + 0.03 * y - 0.02 * x + 1e-3 * y**2 + 3e-3 * y * x - 2e-3 * x**2
+
+    large, small, parts = (4, 3), (13, 10), 3
+    y, x = ((6.0 * places + 2.5).ravel() for places in np.indices(large))
+    slope = np.stack([0.03 + 2e-3 * y + 3e-3 * x, -0.02 + 3e-3 * y - 4e-3 * x])
+    bent = np.repeat([[2e-3], [3e-3], [-4e-3]], y.size, axis=1)
+    seen = np.ones(large, dtype=bool)
+    seen[1, 2] = False
+    forward = SimpleNamespace(shape=CellShape(slope, bent, 6))
+    point = SimpleNamespace(problem=SimpleNamespace(forward=forward), thickness_um=surface(y, x))
+    larger = SimpleNamespace(free=point, cells=SimpleNamespace(cell_px=6, shape=(8, *large), seen=seen))
+    smaller = SimpleNamespace(cells=SimpleNamespace(cell_px=2, shape=(8, *small)))
+    thickness, shape, inside = _in_parts(larger, smaller)  # type: ignore[arg-type]
+    expected = np.zeros(small, dtype=bool)
+    expected[: 3 * large[0], : 3 * large[1]] = np.kron(seen, np.ones((parts, parts))) > 0.0
+    np.testing.assert_array_equal(inside, expected.ravel())
+    y, x = ((2.0 * places + 0.5).ravel()[inside] for places in np.indices(small))
+    np.testing.assert_allclose(thickness[inside], surface(y, x), atol=1e-12)
+    np.testing.assert_allclose(shape.gradient[0, inside], 0.03 + 2e-3 * y + 3e-3 * x, atol=1e-12)
+    np.testing.assert_allclose(shape.gradient[1, inside], -0.02 + 3e-3 * y - 4e-3 * x, atol=1e-12)
+    np.testing.assert_array_equal(shape.hessian[:, inside], bent[:, : inside.sum()][:, :1] + 0.0 * y)
+    assert (shape.cell_px, shape.area) == (2, True)

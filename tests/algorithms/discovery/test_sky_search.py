@@ -198,6 +198,11 @@ def one_frame(**changes: object) -> SkyFringe:
         ([one_frame(), one_frame(airmass=1.9)], "lsst_e2v", "airmass"),
         ([one_frame(detector="R22_S11"), one_frame(detector="R22_S12")], "lsst_e2v", "one sensor"),
         ([one_frame(metadata={"BAND 8-4": 1.0, "FRINGCOR": True})], "lsst_e2v", "corrected|fringe"),
+        (
+            [one_frame(metadata={"BAND 8-4": 1.0, "FRINGCOR": True}, detector="R22_S11")],
+            "lsst_e2v",
+            "R22_S11",
+        ),
     ],
 )
 def test_frames_that_do_not_belong_together_are_refused(

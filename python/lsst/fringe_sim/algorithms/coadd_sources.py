@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,10 @@ from scipy.ndimage import affine_transform
 
 from ..array_types import FloatArray
 from ..errors import named_units
-from ..products import SkyFringe
-from .coadds import VisitPlaces, filled_pattern, patterns_left, placed_visits
+from ..products import FringeComponents, SkyFringe
+from .coadds import Coadds, VisitPlaces, coadds_of_frames, filled_pattern, patterns_left, placed_visits
 from .correction.injection import InjectionOptions, Source, bias_columns, free_places, stamp_side
+from .pca import fit_pca
 
 SINGLE = 8  # Single visits that are looked at; each has some dozens of sources of a kind and flux
 
@@ -133,3 +135,35 @@ def _pieces(
         cut = sum(parts, np.zeros(1))
         made[name] = affine_transform(cut, turn, start, (side, side), order=1, mode="nearest")
     return made
+
+
+@dataclass(frozen=True, eq=False)
+class NightResults:
+    """What frames of a night come to: components, and coadds with the sources in them."""
+
+    components: FringeComponents | None  # of several frames
+    coadds: Coadds | None  # of frames without noise that are large enough
+    sources: Table | None  # in these coadds
+    places_given: bool  # whether the visits of the coadds are at places that were given
+
+    @classmethod
+    def of(
+        cls,
+        frames: Sequence[SkyFringe],
+        seed: int,
+        places: VisitPlaces | None = None,
+        pixel_arcsec: float = 0.2,
+    ) -> NightResults:
+        """Results of frames.
+
+        ``seed``: of places and angles of the coadds, where ``places`` are not given. ``pixel_arcsec``: size of a
+        pixel [arcsec].
+        """
+        quiet = frames[0].seed is None
+        coadds = coadds_of_frames(frames, np.random.default_rng(seed), places) if quiet else None
+        sources = None
+        if coadds is not None:
+            sources = sources_in_coadds(
+                frames, np.random.default_rng(seed), places, pixel_arcsec=pixel_arcsec
+            )
+        return cls(fit_pca(frames) if len(frames) > 1 else None, coadds, sources, places is not None)

@@ -321,11 +321,7 @@ def forecast_sensor(
     noises = np.stack([level.noise(times[1], side) for side in chosen.apertures_arcsec])
     ratios = [np.percentile(moments.rms(each, times[1]) / noises, _HIGH_PERCENTILE, axis=1) for each in left]
     cell_rms = _cell_rms(moments, reference, reference)
-    # The rms over exposures stands for the single ones here.
-    sky = times[1] @ moments.share
-    relative = left[-1] / sky[:, None]
-    square = np.einsum("tc,ayxcd,td->ayx", relative, moments.product, relative) / len(sky)
-    cell_left = np.sqrt(np.maximum(square, 0.0))
+    cell_left = _cell_residual(moments, left[-1], times[1])
     typical = np.sqrt((noises**2).mean(axis=1))[:, None, None]
     x_mm, y_mm = _cell_centres(detector, response.placement, level.pixel_scale_arcsec, chosen.cells)
     radius_deg = math.hypot(response.placement.field_x_deg, response.placement.field_y_deg)
@@ -360,6 +356,14 @@ def _less(vectors: FloatArray, basis: Sequence[FloatArray], metric: FloatArray) 
 def _cell_rms(moments: PatternMoments, vector: FloatArray, factors: FloatArray) -> FloatArray:
     square = np.einsum("tc,ayxcd,td->ayx", vector, moments.product, vector)
     return np.sqrt(np.maximum(square, 0.0)) / float((factors @ moments.share)[0])
+
+
+def _cell_residual(moments: PatternMoments, left: FloatArray, factors: FloatArray) -> FloatArray:
+    """Rms over exposures, which stands for the single ones, of what is left in each cell."""
+    sky = factors @ moments.share
+    relative = left / sky[:, None]
+    square = np.einsum("tc,ayxcd,td->ayx", relative, moments.product, relative) / len(sky)
+    return np.sqrt(np.maximum(square, 0.0))
 
 
 def _block_of(shape: tuple[int, ...], response: SensorResponse, options: ForecastOptions) -> int:

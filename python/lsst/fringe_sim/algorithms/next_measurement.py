@@ -32,7 +32,7 @@ from ..effects import Effect, known_effects
 from ..errors import InputError, UnknownNameError, named_units
 from ..model import FringeModel
 from .flat_series import LEVEL_E, FlatSeries
-from .measurement_forecast import Forecast, Report, Sample, Tested
+from .measurement_forecast import Forecast, Sample, Tested
 
 HIGH_LEVEL_E = 80_000.0
 NARROW_FWHM_NM = 0.5
@@ -117,7 +117,10 @@ def candidate_measurements(
     dark_time_s: Sequence[float] = (),
 ) -> tuple[FlatMeasurement, ...]:
     """Measurements that a test stand can make besides its usual flats."""
-    present = _present(model, wavelength_nm, level_e, dark_time_s)
+    return _candidates(model, _present(model, wavelength_nm, level_e, dark_time_s))
+
+
+def _candidates(model: FringeModel, present: FlatSeries) -> tuple[FlatMeasurement, ...]:
     waves, setup = present.wavelength_nm, model.setup
     n = f"{len(waves)} flats"
     found = [
@@ -128,7 +131,7 @@ def candidate_measurements(
             replace(present, temperature_k=setup.temperature_k - COOLER_K),
         ),
     ]
-    level = HIGH_LEVEL_E if level_e < 0.5 * HIGH_LEVEL_E else 0.2 * level_e
+    level = HIGH_LEVEL_E if present.level_e < 0.5 * HIGH_LEVEL_E else 0.2 * present.level_e
     found.append(FlatMeasurement("level", f"{n} of {level:.0f} electrons", present.at_level(level)))
     if setup.bandwidth_fwhm_nm > 1.5 * NARROW_FWHM_NM:
         title = f"{n} with a bandpass of {NARROW_FWHM_NM:g} nm"
@@ -150,33 +153,29 @@ def candidate_measurements(
 def rank_measurements(
     model: FringeModel,
     effects: Mapping[str, Mapping[str, float]],
+    present: FlatSeries | None = None,
     *,
-    wavelength_nm: Sequence[float] | None = None,
-    level_e: float = LEVEL_E,
-    dark_time_s: Sequence[float] = (),
     thickness_um: tuple[float, float] | None = None,
     significance: float | None = None,
     measurements: Sequence[FlatMeasurement] | None = None,
     nuisance_effects: Sequence[str] = (),
     catalogue: Sequence[Effect] | None = None,
-    report: Report | None = None,
 ) -> tuple[RankedMeasurement, ...]:
     """Rank further measurements by how well they tell apart effects that the present flats cannot.
 
     ``model`` has the effects that are beyond doubt, without those of the class: ``effects``, fitted values by effect
     and parameter, that which was found first. Where nothing is known (an empty mapping) an effect departs from null
-    by its prior scale if it can do so to one side only, and otherwise by little. ``wavelength_nm``, ``level_e`` and
-    ``dark_time_s`` are of the present flats, by default those of the set-up; ``thickness_um`` is by default within
-    1.5 of the stack's. ``significance``: standard deviations by which the present data ask for the effect; without
-    it, that of a whole sensor with photon noise and nothing else unknown, which is far too good: only ratios are to
-    be trusted. ``nuisance_effects`` are known within their prior scale only, and projected out, too.
+    by its prior scale if it can do so to one side only, and otherwise by little. ``present``: the flats that there
+    are, by default those of the set-up; ``thickness_um`` is by default within 1.5 of the stack's. ``significance``:
+    standard deviations by which the present data ask for the effect; without it, that of a whole sensor with photon
+    noise and nothing else unknown, which is far too good: only ratios are to be trusted. ``nuisance_effects`` are
+    known within their prior scale only, and projected out, too.
 
     The largest separation of the hardest pair comes first. Empty if fewer than two of the effects can be forecast:
     those that couple neighbouring pixels, or are in a part of the sensor only, cannot.
     """
     if model.setup.kind != "monochromator":
         raise InputError("set-up", model.setup.name, "a laboratory set-up with a monochromator")
-    say = report or (lambda text: None)
     catalogue = known_effects(catalogue)
     known = {effect.name: effect for effect in catalogue}
     unknown = [name for name in (*effects, *nuisance_effects) if name not in known]
@@ -187,18 +186,17 @@ def rank_measurements(
     if len(tested) < 2:
         return ()
     further = [Tested.of(known[name], {}, model) for name in nuisance_effects if name not in effects]
-    present = _present(model, wavelength_nm, level_e, dark_time_s)
-    forecast = Forecast(
-        model, catalogue, tuple(tested), tuple(further), Sample.of(model, thickness_um), present
-    )
-    chosen = measurements or candidate_measurements(model, wavelength_nm, level_e, dark_time_s)
+    flats = present or _present(model)
+    sample = Sample.of(model, thickness_um)
+    forecast = Forecast(model, catalogue, tuple(tested), tuple(further), sample, flats)
+    chosen = measurements or _candidates(model, flats)
     # Many small matrices: threads of the linear algebra would wait for each other.
     with threadpool_limits(limits=1, user_api="blas"):
-        return _ranked(forecast, chosen, significance, say)
+        return _ranked(forecast, chosen, significance)
 
 
 def _ranked(
-    forecast: Forecast, measurements: Sequence[FlatMeasurement], significance: float | None, say: Report
+    forecast: Forecast, measurements: Sequence[FlatMeasurement], significance: float | None
 ) -> tuple[RankedMeasurement, ...]:
     before = forecast.pairs([forecast.present])
     first, *others = (item.effect.name for item in forecast.tested)
@@ -214,7 +212,6 @@ def _ranked(
         ]
         pairs.sort(key=lambda pair: pair.separation_after)
         ranked.append(RankedMeasurement(measurement, tuple(pairs)))
-        say(ranked[-1].text)
     return tuple(sorted(ranked, key=lambda item: -item.separation))
 
 
@@ -229,7 +226,10 @@ def break_ambiguity(ranked: Sequence[RankedMeasurement]) -> str:
 
 
 def _present(
-    model: FringeModel, wavelength_nm: Sequence[float] | None, level_e: float, dark_time_s: Sequence[float]
+    model: FringeModel,
+    wavelength_nm: Sequence[float] | None = None,
+    level_e: float = LEVEL_E,
+    dark_time_s: Sequence[float] = (),
 ) -> FlatSeries:
     waves = model.setup.wavelengths_nm if wavelength_nm is None else wavelength_nm
     return FlatSeries(

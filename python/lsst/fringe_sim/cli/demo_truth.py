@@ -13,7 +13,7 @@ from ..challenge.demo_case import DemoCase, draw_demo_case, thickness_of_demo
 from ..files import all_or_nothing, write_whole
 from ..instrument.setup import Setup
 from ..mock.raw_frames import write_mock_flats
-from ..mock.visits import write_mock_visits
+from ..mock.visits import VisitConditions, write_mock_visits
 
 LABORATORY, TELESCOPE, SENSOR = "ts8_e2v", "lsst_e2v", "E2V-CCD250-321"
 CASE, FRINGES = "truth.json", "fringes.npz"
@@ -54,10 +54,9 @@ class DemoTruth:
                 setup=TELESCOPE,
                 detector=SENSOR,
                 thickness_um=self.thickness_um(),
-                visits=number,
                 rng=case.visits_rng,
                 effects=case.on_sky,
-                size=self._size,
+                conditions=VisitConditions(number),
             )
         )
         with all_or_nothing(self.folder / FRINGES) as path, path.open("wb") as stream:

@@ -68,7 +68,7 @@ def mock_visits(
     sensor = chosen.sensor(detector)
     shape = shape_of(size, sensor.shape)
     rng = np.random.default_rng(seed)
-    conditions = VisitConditions(stars_per_arcmin2=stars, moon=moon)
+    conditions = VisitConditions(visits, stars_per_arcmin2=stars, moon=moon)
     sources = check_visits(setup, shape, effects.settings, conditions)
     layer = thickness_map(thickness, chosen, shape, rng)
     aside = None if truth is None else _truth_folder(truth, out)
@@ -85,10 +85,8 @@ def mock_visits(
             setup=setup,
             detector=sensor.name,
             thickness_um=layer,
-            visits=visits,
             rng=rng,
             effects=effects.settings,
-            size=f"{shape[1]}x{shape[0]}" if size else None,
             conditions=conditions,
             silicon=silicon,
         )

@@ -104,6 +104,7 @@ def sky(
       fringe-sim sky --setup monocam --thickness e2v_321 --noiseless --exptime 60s --out sky
       fringe-sim sky --thickness fit/thickness.fits --effects-file verdict/effects.py --out sky_with_effects
     """
+    from ..algorithms.coadd_sources import NightResults
     from ..instrument.flat_spectrum import FlatSpectrum
     from ..instrument.night import NightHistory
     from ..report.sky_page import write_sky_report
@@ -142,9 +143,11 @@ def sky(
     made = _written(series, scales, folder / f"sky_{sensor.name}", cards, section)
     if templates:
         _write_templates(layers, model, response, folder / f"fringe_{sensor.name}", cards, sensor)
-    shown: dict[str, Any] = {"picture": folder / "sky.png", "pixel_arcsec": setup.pixel_scale_arcsec}
-    shown |= {"section": section, "origin": origin_of(folder, given)}
-    page = write_sky_report(folder / "report.html", made, setup.name, seed, places, **shown)
+    shown: dict[str, Any] = {"section": section, "origin": origin_of(folder, given)}
+    results = NightResults.of(made, seed, places, setup.pixel_scale_arcsec)
+    page = write_sky_report(
+        folder / "report.html", made, setup.name, results, picture=folder / "sky.png", **shown
+    )
     for line in (*_said(made, model, contrast), folder, page):
         click.echo(str(line))
 

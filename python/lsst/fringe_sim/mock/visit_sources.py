@@ -43,6 +43,7 @@ DTYPE = [("x", float), ("y", float), ("magnitude", float), ("electrons", float),
 class VisitConditions:
     """What the visits of a night look like."""
 
+    visits: int = 1  # number of visits
     # stars_per_arcmin2, galaxies_per_arcmin2: sources brighter than magnitude 22
     stars_per_arcmin2: float = 3.0
     galaxies_per_arcmin2: float = 5.0

@@ -31,7 +31,7 @@ from .film_fields import add_mode, add_periodic_mode, light_in
 from .hidden_effect import ActiveHiddenEffect
 from .hidden_effects import validate_effects, with_hidden_optics
 from .optics import FlatFieldOptics, heights_and_weights
-from .raw_frames import checked_thickness, films_of, parse_size, read_setup_file
+from .raw_frames import checked_thickness, films_of, read_setup_file
 from .signal_table import SignalTable
 from .visit_sources import MASK_PLANES, Pointing, Scene, VisitConditions, VisitImage, expected_sources
 
@@ -231,10 +231,8 @@ def write_mock_visits(
     setup: str,
     detector: int | str,
     thickness_um: NDArray[np.floating],
-    visits: int,
     rng: np.random.Generator,
     effects: Mapping[str, Any] | None = None,
-    size: str | None = None,
     conditions: VisitConditions | None = None,
     silicon: str | None = None,
 ) -> Iterator[MockVisit]:
@@ -243,26 +241,28 @@ def write_mock_visits(
     ``out_dir``: folder for the files; made if it does not exist.
     ``setup``: name of a set-up behind a telescope, or its YAML file.
     ``detector``: number or name of the sensor in the set-up's camera.
-    ``thickness_um``: thickness of the layer that varies [µm], of the size of the sensor.
-    ``visits``: number of visits.
+    ``thickness_um``: thickness of the layer that varies [µm]. A map smaller than the sensor is of a cut-down one,
+        whose pixels are spread over the same part of the field for the beam, and have their usual size for sources.
     ``rng``: source of all randomness.
     ``effects``: hidden effects of the sensor, as for `validate_effects`.
-    ``size``: ``"NXxNY"`` for a cut-down sensor, whose pixels are spread over the same part of the field for
-        the beam, and have their usual size for sources.
-    ``conditions``: sources, seeing, light, and what disturbs.
+    ``conditions``: number of visits, sources, seeing, light, and what disturbs.
     ``silicon``: as for `detected_sky`.
     Returns the files, each written when it is asked for, and the truth, which stands nowhere in them.
     `InputError`, `OutOfRangeError`, `UnknownNameError`: an argument cannot be used; nothing has been written
         then.
     """
+    night = conditions or VisitConditions()
+    visits = night.visits
     if visits < 1:
         raise OutOfRangeError("visits", visits, "1 or more")
-    night = conditions or VisitConditions()
     content = read_setup_file(setup)
     whole = Camera.from_name(str(content["camera"])).detector(detector)
-    sensor = whole if size is None else whole.cut_down(parse_size(size))
-    check_visits(setup, sensor.shape, effects, night)
-    thickness = checked_thickness(thickness_um, sensor.shape)
+    if np.ndim(thickness_um) != 2:
+        raise InputError("thickness map", f"{np.ndim(thickness_um)} dimensions", "rows and columns")
+    shape = (len(thickness_um), len(thickness_um[0]))
+    sensor = whole if shape == whole.shape else whole.cut_down(shape)
+    check_visits(setup, shape, effects, night)
+    thickness = checked_thickness(thickness_um, shape)
     sky = detected_sky(setup, whole, thickness, effects, silicon)
     scene_rng, band_rng, *visit_rngs = rng.spawn(2 + visits)
     light = content["illumination"]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..algorithms.flat_prep_options import GAUSSIAN_MAD
 from ..products import FringeComponents, FringeFrame, SkyFringe, ThicknessMap
-from ..style import LINES, TITLE_PLACE, block_mean, figure, finite_range, panels, show_image
+from ..style import LINES, TITLE_PLACE, block_mean, draw_image, figure, finite_range, panels, show_image
 
 if TYPE_CHECKING:
     from ..algorithms.coadds import Coadds
@@ -171,17 +171,8 @@ def _gallery_figure(
     with figure(SMALL_INCH[0] * columns, SMALL_INCH[1] * rows, None) as made:
         *frames, scale = panels(made, count + 1, columns, (0.3, 0.12, 0.22, 0.22), last)
         for panel, image, wavelength in zip(frames, values, wavelength_nm, strict=True):
-            drawn = show_image(
-                panel,
-                image,
-                label="",
-                title=f"{wavelength:g} nm",
-                diverging=True,
-                limits=limits,
-                colorbar=False,
-                most_px=most_px,
-                step_px=step_px,
-            )
+            drawn = draw_image(panel, image, diverging=True, limits=limits, most_px=most_px, step_px=step_px)
+            panel.set_title(f"{wavelength:g} nm", y=TITLE_PLACE)
             panel.set(xlabel="", ylabel="")
             panel.locator_params(nbins=2)
             panel.tick_params(labelsize=7, length=2)

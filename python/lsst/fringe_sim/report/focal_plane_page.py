@@ -112,7 +112,11 @@ def focal_plane_figure(cells: Table, sensors: Table) -> Figure:
     """Fringes over a focal plane: strength, ratio to the shot noise, what a correction leaves, and field radius.
 
     ``cells``: cells of all sensors (`SensorForecast.to_table`), with the sensor in a column ``detector``.
+
+    `InputError`: there are none.
     """
+    if len(cells) == 0:
+        raise InputError("cells of the focal plane", 0, "one sensor or more")
     templates = _templates(sensors)
     with figure(2 * PLANE_INCH[0], 2 * PLANE_INCH[1]) as made:
         strength, noise, residual, radius = panels(made, 4, 2)
@@ -183,6 +187,5 @@ def _draw_cells(panel: Axes, cells: Table, column: str, norm: Normalize, cmap: s
     reach = 1.05 * max(np.abs(x).max(), np.abs(y).max())
     panel.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x in the focal plane [mm]")
     panel.set_ylabel("y in the focal plane [mm]")
-    if drawn is None:
-        raise InputError("cells of the focal plane", 0, "one sensor or more")
+    assert drawn is not None
     return drawn

@@ -11,9 +11,8 @@ from astropy import units
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from ..algorithms.coadd_sources import sources_in_coadds
-from ..algorithms.coadds import Coadds, VisitPlaces, coadds_of_frames
-from ..algorithms.pca import fit_pca
+from ..algorithms.coadd_sources import NightResults
+from ..algorithms.coadds import Coadds
 from ..files import table_text, write_whole
 from ..products import SensorSection, SkyFringe
 from .figures import coadds_figure, components_figure, sky_figure
@@ -73,20 +72,17 @@ def write_sky_report(
     path: Path,
     frames: Sequence[SkyFringe],
     setup: str,
-    seed: int,
-    places: VisitPlaces | None = None,
+    results: NightResults,
     *,
     picture: Path | None = None,
-    pixel_arcsec: float = 0.2,
     section: SensorSection | None = None,
     origin: Origin | None = None,
 ) -> Path:
-    """Write the page, and ``coadd_sources.ecsv`` beside it where frames without noise are large enough.
+    """Write the page, and ``coadd_sources.ecsv`` beside it where there are sources.
 
-    ``seed``: of places and angles of the coadds, where ``places`` are not given. ``picture``: file beside the page
-    for the first frame with all its pixels, if wanted. ``pixel_arcsec``: size of a pixel [arcsec]. ``section``:
-    pixels of the sensor that the frames show, where that is known. ``origin``: command, and pages
-    of what it was given.
+    ``results``: what the frames come to. ``picture``: file beside the page for the first frame with all its pixels,
+    if wanted. ``section``: pixels of the sensor that the frames show, where that is known. ``origin``: command, and
+    pages of what it was given.
     """
     first = frames[0]
     report = Report(
@@ -97,7 +93,7 @@ def write_sky_report(
         origin or Origin(),
     )
     amplitudes = sky_amplitudes(frames)
-    found = None if first.seed is not None else coadds_of_frames(frames, np.random.default_rng(seed), places)
+    found = results.coadds
     report.summary(_summary(frames, amplitudes, found, section))
     noise = "" if first.seed is None else " In the table they are those of the frames, noise included."
     report.section(
@@ -109,17 +105,16 @@ def write_sky_report(
         shown = PERCENT * first.fraction()
         report.map(picture, shown, mask=first.mask, unit="% of the sky", diverging=True)
     report.table(amplitudes, "sky_fringe_amplitudes")
-    if len(frames) > 1:
+    if results.components is not None:
         report.section("Components", "Principal components of the frames: the templates of a correction.")
-        report.figure(components_figure(fit_pca(frames)), CAPTION_OF_COMPONENTS)
+        report.figure(components_figure(results.components), CAPTION_OF_COMPONENTS)
     if found is not None:
-        report.section("Coadds", COADDS_TEXT if places is None else COADDS_OF_VISITS_TEXT)
+        report.section("Coadds", COADDS_OF_VISITS_TEXT if results.places_given else COADDS_TEXT)
         report.figure(coadds_figure(found), COADDS_CAPTION)
         report.table(coadd_table(found), "coadds")
-        sources = sources_in_coadds(frames, np.random.default_rng(seed), places, pixel_arcsec=pixel_arcsec)
-        if sources is not None:
-            write_whole(path.with_name(SOURCES_FILE), table_text(sources))
-            _show_sources(report, sources)
+        if results.sources is not None:
+            write_whole(path.with_name(SOURCES_FILE), table_text(results.sources))
+            _show_sources(report, results.sources)
     return report.write(path)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from ...effects import Effect
 from ...errors import FringeSimError
 from ...model import FringeModel
+from ..flat_series import LEVEL_E, FlatSeries
 from ..next_measurement import Measurement, RankedMeasurement, break_ambiguity, rank_measurements
 from .cells import CellData
 from .verdict import NamedEffect
@@ -73,13 +74,15 @@ def flats_ranked(
             certain |= {f"{other.name}.{key}": p.value for key, p in other.parameters.items()}
     found = {effect.name: {key: p.value for key, p in effect.parameters.items()}}
     levels = [level for level in cells.geometry.level_e if math.isfinite(level) and level > 0.0]
-    known: dict[str, Any] = {"level_e": sum(levels) / len(levels)} if levels else {}
-    times = cells.geometry.dark_time_s.tolist()
-    if min(times) > 0.0:
-        known["dark_time_s"] = times
+    times = tuple(cells.geometry.dark_time_s.tolist())
+    flats = FlatSeries(
+        tuple(cells.wavelength_nm.tolist()),
+        sum(levels) / len(levels) if levels else LEVEL_E,
+        dark_time_s=times if min(times) > 0.0 else (),
+    )
     ranked = rank_measurements(
-        model.with_effects(certain, catalogue), {**found, **rivals}, wavelength_nm=cells.wavelength_nm.tolist(),
-        thickness_um=thickness_um, significance=effect.significance, catalogue=catalogue, **known,
+        model.with_effects(certain, catalogue), {**found, **rivals}, flats,
+        thickness_um=thickness_um, significance=effect.significance, catalogue=catalogue,
     )  # fmt: skip
     if few and ranked:
         ranked = (*ranked, _more_pixels(ranked[0], cells))

@@ -27,7 +27,8 @@ from .mean_response import normalise_to_cells, spans_orders
 from .nuisances import Nuisances
 from .pixels import PixelFit
 from .rescue import chi2_limits, typical_misfit
-from .silicon import SiliconModel, SiliconSearch
+from .silicon_result import SiliconSearch
+from .silicon_tables import SiliconModel
 from .templates import FringeTemplates
 from .uncertainty import lone_slip_probability, slip_probability
 

@@ -16,16 +16,9 @@ from .global_fit import GlobalFit, global_fit
 from .nuisances import Nuisances
 from .pixels import PixelFit
 from .rescue import typical_misfit
-from .silicon import (
-    STEPS_PER_SILICON_ORDER,
-    SiliconFit,
-    SiliconForecast,
-    SiliconModel,
-    SiliconSearch,
-    SiliconTables,
-    find_silicon,
-    silicon_free,
-)
+from .silicon import STEPS_PER_SILICON_ORDER, find_silicon
+from .silicon_result import SiliconFit, SiliconForecast, SiliconSearch
+from .silicon_tables import SiliconModel, SiliconTables, silicon_free
 from .templates import FringeTemplates
 from .uncertainty import slip_probability
 

@@ -17,8 +17,7 @@ the level of a flat.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,34 +25,16 @@ from scipy.special import ndtr
 
 from ...array_types import BoolArray, FloatArray
 from ...compiled import kernel
-from ...effects.geometry import unit_place
-from ...errors import InputError, OutOfRangeError
-from ...model import FringeModel
-from ...products import ThicknessMap, mask_bits
-from ..thickness_fit_options import SILICON_FIELDS
+from ...errors import InputError
 from .amplitudes import Amplitudes
 from .bands import gather_pixels
 from .newton import gauss_newton
-from .templates import FringeTemplates, pad_wavelengths
+from .silicon_result import SiliconFit, SiliconForecast, SiliconSearch, pixel_places
+from .silicon_tables import NODES_PER_ORDER, SCAN_PER_ORDER, SiliconModel, SiliconTables
+from .templates import pad_wavelengths
 
-__all__ = [
-    "SILICON_FIELDS",
-    "SiliconFit",
-    "SiliconForecast",
-    "SiliconModel",
-    "SiliconSearch",
-    "SiliconTables",
-    "find_silicon",
-    "silicon_free",
-    "silicon_map",
-]
-
-OFFSET = "silicon_thickness.offset"
-_SCAN_PER_ORDER = 12
 STEPS_PER_SILICON_ORDER = 20
 """Tables in one order of the silicon between which cubic interpolation is good to 2e-4 of its fringes."""
-_NODES_PER_ORDER = 100
-"""Thicknesses in one order of the adhesive; linear interpolation is good to 5e-4 of its fringes."""
 _TILES = 16
 _PER_TILE = 16
 _CANDIDATES = 4
@@ -63,170 +44,6 @@ _RESOLVED = 1.0 / 12.0
 _RIVALS = (-3, -2, -1, 1, 2, 3)
 _TILTS = 13
 _CAP = 25.0  # Largest chi-square per wavelength of a pixel in the scan: one bad pixel must not decide
-
-
-@dataclass(frozen=True)
-class SiliconSearch:
-    """What of the silicon is free.
-
-    Raises `OutOfRangeError`: a degree beyond 2, or a length or probability that is not positive.
-    """
-
-    degree: int = 0  # 0 for one thickness of the whole sensor, 1 for a plane, 2 for a paraboloid
-    span_um: float = 1.0  # how far the mean may lie from the thickness in the model, on both sides [µm]
-    tilt_um: float = (
-        0.2  # largest difference between middle and edge of the sensor, for a degree above 0 [µm]
-    )
-    slip_limit: float = (
-        0.01  # the silicon is held fixed if its order would be wrong with a larger probability
-    )
-
-    def __post_init__(self) -> None:
-        if self.degree not in (0, 1, 2):
-            raise OutOfRangeError("degree of the silicon", self.degree, "0, 1 or 2")
-        if not 0.0 < self.span_um <= 20.0:
-            raise OutOfRangeError("span of the silicon [um]", self.span_um, "above 0, at most 20")
-        if not 0.0 < self.tilt_um <= 2.0:
-            raise OutOfRangeError("tilt of the silicon [um]", self.tilt_um, "above 0, at most 2")
-        if not 0.0 < self.slip_limit <= 1.0:
-            raise OutOfRangeError("slip limit", self.slip_limit, "above 0, at most 1")
-
-    def terms(self, y: FloatArray, x: FloatArray) -> FloatArray:
-        """Monomials 1, x, y, x², xy, y² at places of pixels, shape ``(n, n_terms)``.
-
-        A place is -1 in the first and 1 in the last row or column: a wedge is twice its term from edge to edge.
-        """
-        columns = [np.ones_like(x), x, y, x * x, x * y, y * y]
-        return np.stack(columns[: (1, 3, 6)[self.degree]], axis=-1)
-
-
-@dataclass(frozen=True, eq=False)
-class SiliconForecast:
-    """What the flats can tell about the silicon."""
-
-    sigma_um: float  # largest uncertainty of the thickness of the silicon on the sensor, from its fringes alone [µm]
-    slip_probability: float  # probability that its order is wrong
-    order_um: float  # thickness of one fringe order of the silicon [µm]
-    # half peak to peak of its fringes in each flat, as a fraction of the level, ``(n_wavelengths,)``
-    fringe: FloatArray
-    decided: bool  # whether the flats decide
-    reason: str  # why, or why not
-
-
-@dataclass(frozen=True, eq=False)
-class SiliconFit:
-    """Thickness of the silicon over a sensor."""
-
-    search: SiliconSearch  # what was free
-    # of the terms of `SiliconSearch.terms`, relative to the thickness in the model [µm]; zeros if not decided,
-    # ``(n_terms,)``
-    coefficients: FloatArray
-    # their covariance [µm²], larger by the misfit of the flats if that is above one, ``(n_terms, n_terms)``
-    covariance: FloatArray
-    chi2: float  # chi-square per degree of freedom of the pixels that were asked
-    slip_probability: float  # probability that another order of the silicon is the right one
-    forecast: SiliconForecast  # what was to be expected
-
-    @property
-    def decided(self) -> bool:
-        """Whether the thickness was fitted; otherwise it is that of the model."""
-        return self.forecast.decided and self.slip_probability <= self.search.slip_limit
-
-    def offset_um(self, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-        """Thickness minus that of the model at every pixel, and its uncertainty [µm]; arrays of ``shape``."""
-        y, x = np.meshgrid(*(_places(size) for size in shape), indexing="ij")
-        terms = self.search.terms(y.ravel(), x.ravel())
-        variance = np.einsum("ij,jk,ik->i", terms, self.covariance, terms)
-        return (terms @ self.coefficients).reshape(shape), np.sqrt(variance).reshape(shape)
-
-    def cards(self) -> dict[str, Any]:
-        """Keywords for the header of a thickness map."""
-        found: dict[str, Any] = {
-            "SIFIT": self.decided,
-            "SISLIP": round(self.slip_probability, 9),
-            "SIORDER": round(self.forecast.order_um, 6),
-            "SIWHY": self.forecast.reason[:60],
-        }
-        if self.decided:
-            spread = np.sqrt(np.diag(self.covariance))
-            for number, (value, sigma) in enumerate(zip(self.coefficients, spread, strict=True)):
-                found[f"SICOEF{number}"] = round(float(value), 7)
-                found[f"SISIGM{number}"] = round(float(sigma), 8)
-            correlation = self.covariance / np.outer(spread, spread)
-            for first, second in itertools.combinations(range(spread.size), 2):
-                found[f"SICORR{first}{second}"] = round(float(correlation[first, second]), 6)
-        return found
-
-
-def silicon_map(fitted: ThicknessMap, model: FringeModel) -> ThicknessMap | None:
-    """Thickness of the silicon on the pixels of a map that was fitted together with it; `None` if it was not decided.
-
-    ``fitted``: map of the other layer, with the keywords of `SiliconFit.cards`.
-    """
-    header = fitted.metadata
-    if not header.get("SIFIT"):
-        return None
-    count = sum(key.startswith("SICOEF") for key in header)
-    coefficients, spread = (
-        np.array([float(header[f"{word}{number}"]) for number in range(count)])
-        for word in ("SICOEF", "SISIGM")
-    )
-    covariance = np.diag(spread**2)
-    for first, second in itertools.combinations(range(count), 2):
-        shared = float(header[f"SICORR{first}{second}"]) * spread[first] * spread[second]
-        covariance[first, second] = covariance[second, first] = shared
-    search = SiliconSearch({1: 0, 3: 1, 6: 2}[count])
-    system, slip = model.system, float(header["SISLIP"])
-    shape = (fitted.value.shape[0], fitted.value.shape[1])
-    forecast = SiliconForecast(0.0, slip, float(header["SIORDER"]), np.zeros(0), True, str(header["SIWHY"]))
-    found = SiliconFit(search, coefficients, covariance, 1.0, slip, forecast)
-    offset, sigma = found.offset_um(shape)
-    nominal = system.stack.layers[system.stack.position(system.detection)].thickness_um
-    return ThicknessMap(
-        value=(nominal + offset).astype(np.float32),
-        sigma=sigma.astype(np.float32),
-        chi2=np.zeros(shape, np.float32),
-        slip_probability=np.full(shape, slip, np.float32),
-        mask=fitted.mask & mask_bits("NO_DATA"),
-        layer=system.detection,
-        metadata={key: value for key, value in header.items() if key.startswith("SI")},
-        detector=fitted.detector,
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class SiliconTables:
-    """Response against the adhesive for several thicknesses of the silicon."""
-
-    # response; 0 in the padding, float32, ``(n_silicon, n_thickness, padded wavelengths)``
-    response: NDArray[np.float32]
-    # silicon_start_um, silicon_step_um: first silicon, relative to that of the model, and spacing [µm]
-    silicon_start_um: float
-    silicon_step_um: float
-    # start_um, step_um: first thickness of the adhesive and spacing [µm]
-    start_um: float
-    step_um: float
-    wavelengths: int  # number of wavelengths, without padding
-
-    def at(
-        self, silicon_um: FloatArray, thickness_um: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Response and its derivatives [1/µm] by the silicon and by the adhesive, each ``(n, wavelengths)``."""
-        place = (silicon_um - self.silicon_start_um) / self.silicon_step_um
-        first = np.clip(np.floor(place).astype(int) - 1, 0, len(self.response) - 4)
-        value, slope = _lagrange(place - first)
-        row = (thickness_um - self.start_um) / self.step_um
-        below = np.clip(np.floor(row).astype(int), 0, self.response.shape[1] - 2)
-        share = (row - below)[:, None]
-        found, by_silicon, by_thickness = (np.zeros((len(row), self.wavelengths)) for _ in range(3))
-        for k in range(4):
-            low = self.response[first + k, below, : self.wavelengths]
-            rise = self.response[first + k, below + 1, : self.wavelengths] - low
-            here = low + share * rise
-            found += value[k][:, None] * here
-            by_silicon += slope[k][:, None] * here
-            by_thickness += value[k][:, None] * rise
-        return found, by_silicon / self.silicon_step_um, by_thickness / self.step_um
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,92 +68,6 @@ class _Solution:
     coefficients: FloatArray
     information: FloatArray
     chi2: float
-
-
-@dataclass(frozen=True, eq=False)
-class SiliconModel:
-    """The response of the flats of a cube, each with its own width of the line, for any silicon.
-
-    Raises `InputError`: the layer that varies is the silicon itself.
-    """
-
-    model: FringeModel  # the model
-    # wavelength_nm, bandwidth_nm: wavelengths and widths of the lines [nm]. A width as in the set-up, or 0, is that
-    # of the model, ``(n_wavelengths,)``
-    wavelength_nm: FloatArray
-    bandwidth_nm: FloatArray
-
-    def __post_init__(self) -> None:
-        system = self.model.base_system
-        if system.varying == system.detection:
-            raise InputError("varying layer", system.varying, "another than the silicon, for a joint fit")
-
-    def templates(self, like: FringeTemplates, offset_um: float) -> FloatArray:
-        """Response on the grid of templates at a thickness of the silicon, ``(n_thickness, n_wavelengths)``."""
-        return self.on_grid(offset_um, like.start_um, like.step_um, len(like.response))
-
-    def on_grid(self, offset_um: float, start_um: float, step_um: float, count: int) -> FloatArray:
-        """Response on a grid of the adhesive, shape ``(count, n_wavelengths)``."""
-        settings = dict(self.model.effect_settings)
-        settings[OFFSET] = settings.get(OFFSET, 0.0) + offset_um
-        response = np.empty((count, self.wavelength_nm.size))
-        usual = self.model.setup.bandwidth_fwhm_nm
-        for width in np.unique(self.bandwidth_nm):
-            rows = np.flatnonzero(self.bandwidth_nm == width)
-            own = {} if abs(width - usual) < 1e-6 or width == 0.0 else {"bandwidth.fwhm": float(width)}
-            chosen = self.model.with_effects({**settings, **own})
-            response[:, rows] = chosen.response_on_grid(self.wavelength_nm[rows], start_um, step_um, count).T
-        return response
-
-    @property
-    def order_um(self) -> float:
-        """Thickness of one order of the silicon, mean over the flats [µm]."""
-        system = self.model.system
-        index = system.stack.indices(self.wavelength_nm, system.temperature_k)
-        silicon = index[system.stack.position(system.detection)].real
-        return float(np.mean(1e-3 * self.wavelength_nm / (2.0 * silicon)))
-
-    def tables(
-        self,
-        silicon_um: tuple[float, float],
-        per_order: int,
-        thickness_um: tuple[float, float],
-        order_um: float,
-    ) -> SiliconTables:
-        """Tables that cover ranges of both thicknesses, with two nodes of the silicon beyond each end."""
-        step = self.order_um / per_order
-        count = int(np.ceil((silicon_um[1] - silicon_um[0]) / step)) + 5
-        first = silicon_um[0] - 2.0 * step
-        fine = order_um / _NODES_PER_ORDER
-        rows = int(np.ceil((thickness_um[1] - thickness_um[0]) / fine)) + 2
-        padded = [
-            pad_wavelengths(self.on_grid(first + step * k, thickness_um[0], fine, rows)) for k in range(count)
-        ]
-        return SiliconTables(np.stack(padded), first, step, thickness_um[0], fine, self.wavelength_nm.size)
-
-
-def silicon_free(
-    data: Amplitudes, templates: FringeTemplates, model: SiliconModel
-) -> tuple[Amplitudes, FringeTemplates]:
-    """Flats and model for a first fit that does not know the silicon.
-
-    The model is averaged over one order of the silicon, and what its fringes do to a flat counts as noise.
-    """
-    flats = model
-    shifts = flats.order_um * (np.arange(_SCAN_PER_ORDER) + 0.5 - 0.5 * _SCAN_PER_ORDER) / _SCAN_PER_ORDER
-    total = np.zeros(templates.response.shape)
-    square = np.zeros(templates.response.shape)
-    for shift in shifts:
-        response = flats.templates(templates, float(shift))
-        total += response
-        square += response**2
-    mean = total / len(shifts)
-    scatter = np.sqrt(np.maximum(square / len(shifts) - mean**2, 0.0)).mean(axis=0) / mean.mean(axis=0)
-    extra = (scatter / data.scale) ** 2
-    variance = data.variance + np.asarray(extra, np.float32)[:, None, None]
-    return replace(data, variance=variance), replace(
-        templates, response=mean, mean_response=mean.mean(axis=0)
-    )
 
 
 def find_silicon(
@@ -375,11 +106,6 @@ def find_silicon(
     )
 
 
-def _places(size: int) -> FloatArray:
-    """Places of pixels, as effects of a sensor have them."""
-    return unit_place(np.arange(size, dtype=float), size)
-
-
 def _sample(data: Amplitudes, thickness_um: NDArray[np.floating], search: SiliconSearch) -> _Sample:
     """A few pixels of every tile of the sensor, spread evenly over those that have a thickness."""
     ny, nx = thickness_um.shape
@@ -406,7 +132,7 @@ def _sample(data: Amplitudes, thickness_um: NDArray[np.floating], search: Silico
     seen = weight > 0.0
     level = np.where(seen, 1.0 + value, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     value = (1.0 + value) / np.where(level > 0.0, level, 1.0) - 1.0
-    place = np.stack([_places(ny)[rows], _places(nx)[columns]], axis=-1)
+    place = np.stack([pixel_places(ny)[rows], pixel_places(nx)[columns]], axis=-1)
     return _Sample(
         value,
         weight,
@@ -427,8 +153,8 @@ def _forecast(
 ) -> SiliconForecast:
     order = flats.order_um
     reach = (max(_RIVALS) + 0.5) * order
-    tables = flats.tables((-reach, reach), _SCAN_PER_ORDER, _range_of(sample, order_um), order_um)
-    shifts = order * (np.arange(_SCAN_PER_ORDER) / _SCAN_PER_ORDER - 0.5)
+    tables = flats.tables((-reach, reach), SCAN_PER_ORDER, _range_of(sample, order_um), order_um)
+    shifts = order * (np.arange(SCAN_PER_ORDER) / SCAN_PER_ORDER - 0.5)
     amplitude, by_silicon, by_thickness = [], [], []
     everywhere = np.ones(len(sample.value))
     for shift in shifts:
@@ -485,7 +211,7 @@ def _largest_sigma(information: FloatArray, search: SiliconSearch) -> float:
 def _scan(flats: SiliconModel, sample: _Sample, search: SiliconSearch, order_um: float) -> list[FloatArray]:
     """Coefficients of the best few minima on a coarse grid."""
     span = search.span_um + (search.tilt_um if search.degree else 0.0)
-    tables = flats.tables((-span, span), _SCAN_PER_ORDER, _range_of(sample, order_um), order_um)
+    tables = flats.tables((-span, span), SCAN_PER_ORDER, _range_of(sample, order_um), order_um)
     steps = np.arange(len(tables.response), dtype=np.float64)
     offsets = tables.silicon_start_um + tables.silicon_step_um * steps
     everywhere = np.ones(len(sample.value))
@@ -494,9 +220,9 @@ def _scan(flats: SiliconModel, sample: _Sample, search: SiliconSearch, order_um:
     )
     if search.degree:
         # Over a sensor that spans orders of silicon its fringes average out.
-        window = np.ones(_SCAN_PER_ORDER) / _SCAN_PER_ORDER
+        window = np.ones(SCAN_PER_ORDER) / SCAN_PER_ORDER
         means = np.stack([np.convolve(column, window, "same") for column in means.T], axis=-1)
-        half = _SCAN_PER_ORDER // 2
+        half = SCAN_PER_ORDER // 2
         means[:half], means[-half:] = means[half], means[-half - 1]
     curves = np.zeros((_TILES**2, len(offsets)))
     places = (sample.thickness_um - tables.start_um) / tables.step_um
@@ -504,7 +230,7 @@ def _scan(flats: SiliconModel, sample: _Sample, search: SiliconSearch, order_um:
         chi2 = np.empty(len(places))
         _scan_pixels(
             tables.response[number], places, pad_wavelengths((1.0 + sample.value) * mean),
-            pad_wavelengths(sample.weight / mean**2), 0.1 * _NODES_PER_ORDER, chi2,
+            pad_wavelengths(sample.weight / mean**2), 0.1 * NODES_PER_ORDER, chi2,
         )  # fmt: skip
         np.minimum(chi2, _CAP * flats.wavelength_nm.size, out=chi2)
         curves[:, number] = np.bincount(sample.tile, chi2, _TILES**2)
@@ -611,19 +337,6 @@ def _normal_equations(
     gradient = np.array([(weight * wave * left).sum() for wave in columns])
     information = np.array([[(weight * one * two).sum() for two in columns] for one in columns])
     return gradient, information, float((weight * left**2).sum()), move
-
-
-def _lagrange(place: Any) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Weights of nodes 0 to 3 for the value and the derivative of a cubic at a place between them."""
-    nodes = range(4)
-    values, slopes = [], []
-    for k in nodes:
-        others = [j for j in nodes if j != k]
-        scale = float(np.prod([k - j for j in others]))
-        a, b, c = (place - j for j in others)
-        values.append(a * b * c / scale)
-        slopes.append((a * b + a * c + b * c) / scale)
-    return values, slopes
 
 
 @kernel
