@@ -19,6 +19,11 @@ from lsst.fringe_sim.products import FringeCube, ThicknessMap
 SHAPE = (160, 192)  # Amplifiers of 80 by 24 pixels
 
 
+A_CORNER_IS_OFF = pytest.mark.xfail(
+    strict=True, reason="A corner is off by up to 180 nm unmasked, own pulls are 1.8 (doc/thickness_fit.md)."
+)
+
+
 @pytest.fixture(scope="module")
 def model() -> FringeModel:
     return FringeModel.from_setup("ts8_e2v")
@@ -103,10 +108,7 @@ def test_contrast_that_falls_with_the_thickness(name, model, rng) -> None:
 @pytest.mark.parametrize(
     ("name", "electrons", "seed"),
     [
-        pytest.param(
-            *("roughness 80 nm", 20_000, 41_016),
-            marks=pytest.mark.xfail(strict=True, reason="2 % of the pixels are off where 0.7 % are foretold"),
-        ),
+        pytest.param("roughness 80 nm", 20_000, 41_016, marks=A_CORNER_IS_OFF),
         ("one flat 2 nm off", 5_000, 41_105),
     ],
 )
@@ -116,7 +118,10 @@ def test_fringes_that_no_pixel_shows_are_not_taken_for_those_of_a_flat_sensor(
     """What cells see, and single pixels do not: most of the map was wrong, with an uncertainty of 1 to 3 nm."""
     faint = replace(ROWS[name], contrast=0.05, electrons=electrons)
     result = fit_one(faint, seed, model, 128)[1]
-    assert result.masked == 1.0 or result.wrong < 2.0 * result.foretold, str(result)
+    if result.masked < 1.0:
+        assert result.wrong < 2.0 * result.foretold, str(result)
+        assert result.own < 1.3, str(result)
+        assert abs(result.common) < 4.0, str(result)
 
 
 @pytest.mark.slow

@@ -175,16 +175,7 @@ def test_a_surface_across_a_step_is_believed_less(step_um, rng) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "ridge",
-    [
-        False,
-        pytest.param(
-            True,
-            marks=pytest.mark.xfail(strict=True, reason="this draw is a whole order off, and not masked"),
-        ),
-    ],
-)
+@pytest.mark.parametrize("ridge", [False, True])
 @pytest.mark.rng("weak pixels about a step or a ridge")
 def test_weak_pixels_about_a_step(ridge, rng) -> None:
     """Flats of the other simulator at a contrast of 0.13 and 6,000 electrons: a step of 0.15 orders, and a ridge."""

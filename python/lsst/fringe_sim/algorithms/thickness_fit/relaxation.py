@@ -1,9 +1,9 @@
 """Second thoughts about the orders of cells: lone cells, steps that phases cannot show, and how sure each is.
 
 Joining cells by their phases has two blind spots. Noise can put a single cell on a phase that is no whole order
-away from its neighbours; and a step in the layer of exactly one or more orders leaves no mark on the phases at
-all. Here every cell is asked again, with the templates as they are normalised by now, what chi-square it has a
-few orders above and below its thickness; blocks of cells, from large to small, move to the order that costs
+away from its neighbours (`join_neighbours`); and a step in the layer of exactly one or more orders leaves no mark on
+the phases at all. Here every cell is asked again, with the templates as they are normalised by now, what chi-square
+it has a few orders above and below its thickness; blocks of cells, from large to small, move to the order that costs
 least, where the cost is the chi-square of their cells and a price for each break along their border.
 """
 
@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...compiled import kernel, run_threaded, subkernel
+from .between_orders import Rises, break_price, join_neighbours
 from .cells import Cells, cell_independence, effective_number
 from .evidence import EVIDENCE_CAP, IMPOSSIBLE, OrderEvidence
 from .lone_surfaces import settle_lone_surfaces
 from .misfit import Misfit, improbability, judge_cells
 from .newton import gauss_newton
+from .pixels import SAME_SURFACE
 from .templates import FringeTemplates
 
 SHIFTS = 3  # Orders above and below that are tried in one round
-BREAK_PRICE = 8.0  # Chi-square that a break of half an order or more between two neighbouring cells costs
-SAME_SURFACE = 0.25  # Cells that agree within this many orders, slopes allowed for, lie on one surface
 _LARGEST_MENDED = 400  # Largest surface, in cells, that is moved onto the one around it, whatever the jump
 _MOST_JUDGED = 20_000  # Cells that show how far all are off
 _LARGEST_BLOCK = 64
@@ -75,6 +75,11 @@ def settle_orders(
     rise_x = slope_x * np.diff(cells.x_edges).astype(np.float32)[None, :]
     table = templates.table()
     grid = (templates.start_um, templates.step_um)
+    misfit, _ = _judge_cells(cells, templates, thickness, order_um)
+    thickness = join_neighbours(
+        cells, templates, thickness, Rises(rise_y, rise_x), order_um,
+        range_um=range_um, temper=temper, misfit=misfit, threads=threads,
+    )  # fmt: skip
     misfit, alike = _judge_cells(cells, templates, thickness, order_um)
     shifted = np.zeros((*thickness.shape, 2 * SHIFTS + 1), np.float32)
     cost = np.zeros_like(shifted)
@@ -144,13 +149,6 @@ def _used(weight, item):  # type: ignore[no-untyped-def]
     for band in range(weight.shape[1]):
         number += 1 if weight[item, band] > 0.0 else 0
     return number
-
-
-@subkernel(expand=True)
-def _break_price(jump, order):  # type: ignore[no-untyped-def]
-    """Price of a jump between two neighbours: grows as its square, up to half an order."""
-    share = 2.0 * jump / order
-    return BREAK_PRICE * min(share * share, 1.0)
 
 
 @kernel
@@ -247,7 +245,7 @@ def _border_price(shifted, label, rise_y, rise_x, order, y, x, move, top, bottom
             rise = 0.5 * (rise_y[y, x] + rise_y[b, a]) * (b - y) + 0.5 * (rise_x[y, x] + rise_x[b, a]) * (
                 a - x
             )
-            total += _break_price(there - here - rise, order)
+            total += break_price(there - here - rise, order)
     return total
 
 
@@ -347,8 +345,8 @@ def _segment_borders(shifted, label, segment, rise_y, rise_x, order, count):  # 
                 )
                 jump = shifted[b, a, label[b, a] + middle] - shifted[y, x, label[y, x] + middle] - rise
                 for k in range(shifts):
-                    price[segment[y, x], k] += _break_price(jump - (k - middle) * order, order)
-                    price[segment[b, a], k] += _break_price(jump + (k - middle) * order, order)
+                    price[segment[y, x], k] += break_price(jump - (k - middle) * order, order)
+                    price[segment[b, a], k] += break_price(jump + (k - middle) * order, order)
     return price
 
 
