@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from lsst.fringe_sim.algorithms.inference import (
     CellShape,
+    Coordinate,
     Data,
     Forward,
     Point,
@@ -121,6 +122,46 @@ def test_gradients_are_differences(key: str, rng: np.random.Generator) -> None:
     step = 0.01 * item.scale
     costs = [with_best_cells(at, {key: start + sign * step}, at.levels).cost for sign in (1.0, -1.0)]
     assert gradient == pytest.approx((costs[0] - costs[1]) / (2.0 * step), rel=2e-3, abs=0.02 / item.scale)
+
+
+def offset_of_index(point: Point) -> Coordinate:
+    """The index of the adhesive: with a lower one cells are thicker, and fringes nearly the same."""
+    items = coordinates_of(BY_NAME["epoxy_index"], point.problem.forward)
+    return next(item for item in items if item.parameter == "offset")
+
+
+@pytest.mark.rng("index of the adhesive")
+def test_thicker_cells_of_a_lower_index_are_no_likelier(rng: np.random.Generator) -> None:
+    point = point_of(rng, {}, response=1e-5)
+    item = offset_of_index(point)
+    both = [
+        with_best_cells(point, {item.key: sign * 0.02 * item.scale}, point.levels) for sign in (-1.0, 1.0)
+    ]
+    phase, amplitude, beside_energy = (
+        np.diff([told(one) for one in both])[0]
+        for told in (
+            lambda one: one.problem.forward.log_phase(one.settings),
+            lambda one: np.log(one.value.std(axis=1)).mean(),
+            lambda one: one.cost - one.cell_energy.sum(),
+        )
+    )
+    half = 0.5 * point.thickness_um.size
+    assert phase > 0.0
+    assert beside_energy == pytest.approx(half * amplitude, abs=0.15 * half * phase)
+
+
+@pytest.mark.rng("derivative of the index")
+def test_a_shift_of_the_phase_is_no_loss_of_contrast(rng: np.random.Generator) -> None:
+    point = point_of(rng, {}, response=1e-5)
+    item = offset_of_index(point)
+    step = item.difference(item.null)
+    up, down = (
+        point.problem.forward.predict({item.key: sign * step}, point.thickness_um)[0] for sign in (1.0, -1.0)
+    )
+    # What the thickness does not follow is a thousandth of the column.
+    expected = point.projected(point.whitened((up - down) / (2.0 * step)))
+    found = point.projected(effect_columns(point, [item]).value[0])
+    assert np.linalg.norm(found - expected) < 0.03 * np.linalg.norm(expected)
 
 
 @pytest.mark.rng("gradient of levels")

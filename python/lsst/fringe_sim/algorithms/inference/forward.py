@@ -52,6 +52,7 @@ class Forward:
     _tables: dict[_Key, FloatArray] = field(default_factory=dict, repr=False)
     _rows: dict[tuple[_Key, int, float], FloatArray] = field(default_factory=dict, repr=False)
     _by_name: dict[str, Effect] = field(default_factory=dict, repr=False)
+    _phases: dict[_Key, float] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         self._by_name.update({effect.name: effect for effect in self.catalogue})
@@ -65,6 +66,13 @@ class Forward:
     def order_um(self) -> float:
         """Thickness of one fringe order in the middle of the wavelengths [µm]."""
         return float(self.model.fringe_order_um(np.median(self.geometry.wavelength_nm)))
+
+    def log_phase(self, settings: Settings) -> float:
+        """Mean logarithm, over the exposures, of the fringe phase per thickness over that of the unchanged model.
+
+        Of the places that are not on islands.
+        """
+        return self._log_phase(settings) - self._log_phase({})
 
     def effect_of(self, key: str) -> Effect:
         """The effect that a setting belongs to."""
@@ -152,6 +160,22 @@ class Forward:
         return math.hypot(
             *(item.effect.blur_px(item.values) for item in active if self._is_blur(item.effect))
         )
+
+    def _log_phase(self, settings: Settings) -> float:
+        everywhere = {
+            key: value
+            for key, value in {**self.model.effect_settings, **settings}.items()
+            if self.effect_of(key).acts_on != "image" and not self.effect_of(key).local
+        }
+        key = tuple(sorted(everywhere.items()))
+        if key not in self._phases:
+            if len(self._phases) > MOST_TABLES:
+                self._phases.clear()
+            system = self._model(everywhere).system
+            light = system.flat_fields(self.geometry.wavelength_nm, LINE_STEP_NM)
+            phase = system.reduce(light).kappa[0].real  # of every state but harmonics that were added
+            self._phases[key] = float(np.log(np.average(phase, axis=1, weights=light.weight)).mean())
+        return self._phases[key]
 
     # Tables ---------------------------------------------------------------------------------------------------
 

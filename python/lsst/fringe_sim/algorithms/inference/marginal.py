@@ -38,6 +38,15 @@ class Problem:
     thickness_sigma_um: float | FloatArray = 10.0  # of all or each; many orders pull no cell and favour none
     known: bool = False  # whether the first thickness is measured: it stays, and no cell changes its order
 
+    @property
+    def phase_share(self) -> float:
+        """What the logarithm of the phase per thickness adds to half of that of the curvatures of the cells.
+
+        Nothing where the thickness is measured, or every cell has an error of its own: there its scale has a meaning.
+        """
+        measured = self.known or np.ndim(self.thickness_sigma_um) > 0
+        return 0.0 if measured else 0.5 * float(self.data.seen.sum())
+
     def at(self, settings: Mapping[str, float], levels: FloatArray, thickness_um: FloatArray) -> Point:
         """The likelihood linearised about effects, levels ``(W,)`` and thickness ``(N,)``."""
         value, slope = self.forward.predict(settings, thickness_um)
@@ -165,10 +174,12 @@ class Point:
         """The same with the curvature that the data have: the mean of the model's and of one number.
 
         The curvature along thickness at the best is the square of the slope less the second derivative times the
-        residual. For fringes of amplitude A in data of amplitude a it is A a instead of A², so that half of the
-        logarithm depends on the model.
+        residual. For fringes of amplitude A in data of amplitude a it is A a k² instead of A² k², with k the phase
+        per thickness, so that half of the logarithm depends on A. None may depend on k: fringes are the same with
+        thicker cells of a lower index.
         """
-        return self.log_det - 0.5 * float(np.log(self._root[2]).sum())
+        half = 0.5 * float(np.log(self._root[2]).sum())
+        return self.log_det - half - self.problem.phase_share * self.problem.forward.log_phase(self.settings)
 
     @cached_property
     def cost(self) -> float:
@@ -184,12 +195,16 @@ class Point:
 
     # Dense parameters -----------------------------------------------------------------------------------------
 
-    def columns(self, values: FloatArray, slopes: FloatArray) -> Columns:
-        """Dense columns from whitened derivatives of value and slope, each ``(K, W, N)``."""
+    def columns(self, values: FloatArray, slopes: FloatArray, log_phase: FloatArray | float = 0.0) -> Columns:
+        """Dense columns from whitened derivatives of value and slope, each ``(K, W, N)``.
+
+        ``log_phase`` (K,): derivative of the logarithm of the phase per thickness.
+        """
         along = self._along(values)
         cells = self._forward_solved(along)
         us, ts = (np.einsum("wn,...wn->...n", own, slopes) for own in (self.response, self.steep))
-        return Columns(values, cells, self._log_det_change(along, us, ts, cells))
+        change = self._log_det_change(along, us, ts, cells) - self.problem.phase_share * np.asarray(log_phase)
+        return Columns(values, cells, np.asarray(change))
 
     def bare_columns(self, values: FloatArray) -> Columns:
         """Dense columns ``(K, W, N)``; what they do to the log determinant is not asked."""

@@ -63,18 +63,33 @@ class Hypothesis:
 
 
 def effect_columns(point: Point, items: Sequence[Coordinate], secant: float = SECANT) -> Columns:
-    """Derivatives with respect to parameters of effects; ``secant``: see `Coordinate.difference`."""
+    """Derivatives with respect to parameters of effects; ``secant``: see `Coordinate.difference`.
+
+    A difference is taken along the thickness of equal phase, and what that adds is put back: otherwise half of the
+    step times the square of a phase of hundreds of radians per unit would look like a loss of contrast.
+    """
     shape = (len(items), *point.value.shape)
-    values, slopes = np.empty(shape), np.empty(shape)
+    values, slopes, phases = np.empty(shape), np.empty(shape), np.empty(len(items))
+    forward = point.problem.forward
     for row, item in enumerate(items):
         now = point.settings.get(item.key, item.null)
         step = item.difference(now, secant)
-        value, slope = point.problem.forward.predict(
-            {**point.settings, item.key: now + step}, point.thickness_um
-        )
+        settings = {**point.settings, item.key: now + step}
+        phase = forward.log_phase(settings) - forward.log_phase(point.settings)
+        follows = bool(phase) and not item.step and secant == SECANT
+        moved_um = point.thickness_um * math.expm1(-phase) if follows else 0.0
+        value, slope = forward.predict(settings, point.thickness_um + moved_um)
         values[row] = point.whitened((value - point.value) / step)
         slopes[row] = point.whitened((slope - point.slope) / step)
-    return point.columns(values, slopes)
+        if follows:
+            up, down = (
+                forward.predict(point.settings, point.thickness_um + sign * moved_um)[1]
+                for sign in (1.0, -1.0)
+            )
+            values[row] -= point.steep * moved_um / step
+            slopes[row] -= point.whitened((up - down) / (2.0 * step))
+        phases[row] = phase / step
+    return point.columns(values, slopes, phases)
 
 
 def relaxed(point: Point, rounds: int = 3, tolerance: float = 0.02) -> Point:

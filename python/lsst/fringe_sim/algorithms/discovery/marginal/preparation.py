@@ -39,7 +39,6 @@ MARGIN_UM = 0.8
 
 FIRST_ERROR_UM = 0.004  # Error of the first thickness [µm]: it is one of steps of 0.01
 SURFACE_CELLS = 8.0  # Distance of the knots of the surface whose slope limits the size of cells [cells]
-AROUND = 5  # Side of the part about a cell whose median tells its fringe order [cells]
 KNOWN_UM = 1e-6  # Error of a thickness that is known [µm]
 
 NO_SCATTER, FIRST_SCATTER = 1e-6, 0.003
@@ -166,7 +165,7 @@ def _in_cells(
     factor = np.ones(cells.shape[0])
     for _ in range(2):
         spoiled = spoiled_cells(_left(point, cells), cells.weight > 0.0)
-        cells, noise, problem = _judged(cells.restricted(~spoiled), point)
+        cells, noise, problem = _judged(cells.restricted(~spoiled), point, rules)
         factor = factor * noise
         start_um = point.thickness_um if problem.known else problem.thickness_um
         point = with_free_contrast(problem.at({}, point.levels, start_um), rounds=4)
@@ -208,7 +207,7 @@ def _steepest_um(prepared: Prepared) -> float:
 def prepare_again(prepared: Prepared, found: Hypothesis, rules: Rules) -> Prepared:
     """Noise, and what pixels see and the thickness does within cells, as judged with effects in the model."""
     point = _with_likelier_pixels(with_free_contrast(with_common_offset(found.point)), rules)
-    cells, noise, problem = _judged(prepared.cells, point)
+    cells, noise, problem = _judged(prepared.cells, point, rules)
     # Every fit may return to the first thickness, whatever has been fitted since.
     problem = replace(_as_modelled(problem), thickness_um=prepared.problem.thickness_um)
     null = problem.at({}, prepared.point.levels, prepared.point.thickness_um)
@@ -223,14 +222,14 @@ def prepare_again(prepared: Prepared, found: Hypothesis, rules: Rules) -> Prepar
     )
 
 
-def _judged(cells: CellData, point: Point) -> tuple[CellData, FloatArray, Problem]:
+def _judged(cells: CellData, point: Point, rules: Rules) -> tuple[CellData, FloatArray, Problem]:
     """Cells with the noise that a fit leaves, its measured over stated deviation, and the problem about the fit."""
     expected = (point.levels[:, np.newaxis] * point.value).reshape(cells.shape)
     cells = cells.with_noise_of(expected)
     point = with_error_of_map(point.problem_with(_data(cells)), cells)
     noise, scatter = measured_noise(point, cells.shape)
     cells = cells.scaled_noise(noise, scatter)
-    old, thickness = point.problem.forward, _whole(point, cells)
+    old, thickness = point.problem.forward, _whole(point, cells, rules.order_side)
     # Levels tell how many electrons a mean of one is; they are known from the first fit on.
     geometry = old.geometry
     if geometry is cells.geometry:
@@ -256,25 +255,26 @@ def _left(point: Point, cells: CellData) -> FloatArray:
     )
 
 
-def _whole(point: Point, cells: CellData) -> FloatArray:
+def _whole(point: Point, cells: CellData, side: int) -> FloatArray:
     """Thickness of all cells, ``(ny, nx)``, in the orders of their neighbours.
 
     Where there are no data, it is continued from where there are.
     """
     field = point.thickness_um.reshape(cells.shape[1:])
-    return continued(_in_order_of_neighbours(field, cells.seen, point.problem.forward.order_um), cells.seen)
+    order_um = point.problem.forward.order_um
+    return continued(_in_order_of_neighbours(field, cells.seen, order_um, side), cells.seen)
 
 
-def _in_order_of_neighbours(field: FloatArray, seen: BoolArray, order_um: float) -> FloatArray:
+def _in_order_of_neighbours(field: FloatArray, seen: BoolArray, order_um: float, side: int) -> FloatArray:
     """A thickness moved by whole fringe orders to within half of one of its neighbours, whose medians are a plane.
 
     A few cells in another order, mostly at the rim of a part without data, have a slope that is an order per cell.
     With that slope they fit best where they are.
     """
     known = np.where(seen, field, np.nan)
-    middle = _around(known, seen)
-    for axis, away in enumerate(np.indices((AROUND, AROUND)).reshape(2, -1) - AROUND // 2):
-        steps = _around(np.diff(known, axis=axis, append=np.nan), seen)
+    middle = _around(known, seen, side)
+    for axis, away in enumerate(np.indices((side, side)).reshape(2, -1) - side // 2):
+        steps = _around(np.diff(known, axis=axis, append=np.nan), seen, side)
         steps[np.isnan(steps).all(axis=-1)] = 0.0
         middle -= np.nanmedian(steps, axis=-1)[:, np.newaxis] * away
     whole = field.copy()
@@ -282,11 +282,11 @@ def _in_order_of_neighbours(field: FloatArray, seen: BoolArray, order_um: float)
     return whole
 
 
-def _around(values: FloatArray, where: BoolArray) -> FloatArray:
-    """Values about every place that is asked for, ``(N, AROUND²)``; beyond the edges there are none."""
-    padded = np.pad(values, AROUND // 2, constant_values=np.nan)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (AROUND, AROUND))
-    return np.array(windows[where].reshape(-1, AROUND**2))
+def _around(values: FloatArray, where: BoolArray, side: int) -> FloatArray:
+    """Values about every place that is asked for, ``(N, side²)``; beyond the edges there are none."""
+    padded = np.pad(values, side // 2, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (side, side))
+    return np.array(windows[where].reshape(-1, side**2))
 
 
 def _data(cells: CellData) -> Data:
