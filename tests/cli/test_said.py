@@ -313,7 +313,7 @@ def test_mocks_tell_what_they_write(say: Say, tmp_path: Path, monkeypatch) -> No
     def of_visits(folder: Path, **settings: Any) -> Any:
         asked.append(settings)
         picture = np.zeros((8, 8), np.float32)
-        for number in range(settings["visits"]):
+        for number in range(settings["conditions"].visits):
             yield visits.MockVisit(folder / f"visit_{number}.fits", picture + 2.0, 1234.0 + number)
 
     monkeypatch.setattr(raw_frames, "write_mock_flats", flats)
