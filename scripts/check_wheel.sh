@@ -25,7 +25,8 @@ PATH="$work/clean/bin:$PATH" "$work/clean/bin/python" "$root/scripts/wheel_smoke
 
 # An extra sees the clean environment and adds what it lacks; no extra sees another.
 below=$("$work/clean/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
-for extra in $("$work/clean/bin/python" "$root/scripts/wheel_smoke.py" --extras); do
+extras=$("$work/clean/bin/python" "$root/scripts/wheel_smoke.py" --extras)
+for extra in $extras; do
     echo "The extra $extra"
     env="$work/extra-$extra"
     "$bin/python" -m venv "$env"

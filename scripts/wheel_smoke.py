@@ -72,8 +72,16 @@ def postgres() -> None:
     create_engine("postgresql+psycopg2://nobody@localhost/nothing")  # imports the driver, connects to nothing
 
 
+def lsst_images() -> None:
+    """The reader of files of ``lsst.images``, which no release for Python 3.11 has."""
+    if sys.version_info >= (3, 12):
+        from lsst.images.serialization import open_archive
+
+        assert callable(open_archive)
+
+
 EXTRAS: dict[str, Callable[[], None]] = {
-    each.__name__: each for each in (speclite, xarray, htcondor, postgres)
+    each.__name__.replace("_", "-"): each for each in (speclite, xarray, htcondor, postgres, lsst_images)
 }
 FOR_DEVELOPERS = {"test", "docs", "bench"}
 """Extras that `make` installs into its own environment, where all tests run with them."""
