@@ -9,7 +9,8 @@ The status is 1 if a smaller part than ``--least`` was noticed, and 2 if the tes
 
 All quick tests run for every breakage, unless ``--record`` has written down which tests execute which lines (with the
 package coverage) into a folder that ``--keep`` names. Then only those run that execute the broken statement, the
-cheapest first and no more than ``--most-seconds`` of them; what no test executes has survived.
+cheapest first and no more than ``--most-seconds`` of them. What no test notices is shown to mypy, which is part of
+``make test`` as well.
 """
 
 from __future__ import annotations
@@ -274,6 +275,13 @@ class Copy:
         said = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
         return said[0] if said else (done.stdout + done.stderr).strip().splitlines()[-1]
 
+    def types(self) -> str:
+        """The first line that says which types do not fit; empty if all do."""
+        done = subprocess.run(
+            [sys.executable, "-m", "mypy"], cwd=self.root, capture_output=True, text=True, check=False
+        )
+        return done.stdout.splitlines()[0] if done.returncode else ""
+
     def trial(self, breakage: Breakage, runs: list[list[str]], users: list[Function]) -> str:
         """What notices a breakage, of several runs of tests in turn; empty if nothing does.
 
@@ -289,7 +297,8 @@ class Copy:
             for kept in cache.glob(f"*/{function.path.stem}.*{function.name}-*"):
                 kept.unlink()
         try:
-            return next(filter(None, (self.notices(tests, cache) for tests in runs if tests)), "")
+            noticed = next(filter(None, (self.notices(tests, cache) for tests in runs if tests)), "")
+            return noticed or self.types()
         finally:
             path.write_bytes(breakage.source)
             os.utime(path, ns=(written.st_atime_ns, written.st_mtime_ns))  # the cache stays good
@@ -391,7 +400,7 @@ def main() -> int:
             print("\n".join(map(difference, drawn)))
             return 0
         touched = copy.touched()
-        failed = "" if touched else copy.notices(["tests"], copy.cache)
+        failed = copy.types() or ("" if touched else copy.notices(["tests"], copy.cache))
         if failed:
             print(f"with nothing broken: {failed}", file=sys.stderr)
             return 2
