@@ -217,7 +217,9 @@ def test_yaml_is_as_deep_and_as_long_as_it_may_be(tmp_path: Path) -> None:
         read_user_text(tmp_path / "a", "x", 4)
 
 
-@pytest.mark.parametrize(("letters", "good"), [("\U0001f600" * 20, True), ("a" * 20, True), ("a" * 21, False)])
+@pytest.mark.parametrize(
+    ("letters", "good"), [("\U0001f600" * 20, True), ("a" * 20, True), ("a" * 21, False)]
+)
 def test_a_yaml_file_is_measured_in_characters(
     letters: str, good: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -334,7 +336,9 @@ def test_what_cannot_be_kept_is_compiled_anew(
     compiled._work_without_cache(SimpleNamespace(_cache=None), None)
 
 
-@pytest.mark.parametrize(("own", "for_all", "found"), [(1, None, 1), (1, 2, 2), (None, 2, 2), (None, None, None)])
+@pytest.mark.parametrize(
+    ("own", "for_all", "found"), [(1, None, 1), (1, 2, 2), (None, 2, 2), (None, None, None)]
+)
 def test_what_is_kept_for_all_is_looked_into_first(own: Any, for_all: Any, found: Any) -> None:
     def kept(what: Any) -> Any:
         return SimpleNamespace(load_overload=lambda *given: what, save_overload=None)

@@ -171,6 +171,14 @@ def test_a_map_of_a_part_of_a_sensor_is_held_against_frames_of_that_part(tmp_pat
     part.header["DETSEC"] = "[101:164,201:248]"
     part.writeto(tmp_path / "map.fits")
     frames = [write_frame(tmp_path / f"{seed}.fits", seed, 48, 64) for seed in (1, 2)]
-    command = ["fit-sky", *frames, "--setup", "monocam", "--thickness", str(tmp_path / "map.fits"), "--dry-run"]
+    command = [
+        "fit-sky",
+        *frames,
+        "--setup",
+        "monocam",
+        "--thickness",
+        str(tmp_path / "map.fits"),
+        "--dry-run",
+    ]
     assert run([*command, "--out", str(tmp_path / "out")]) == 0
     assert capsys.readouterr().out.endswith("against 2 frames\n")

@@ -124,8 +124,6 @@ def test_bad_quantities_are_usage_errors(text) -> None:
 def test_wavelength_ranges_include_the_end() -> None:
     assert WAVELENGTHS.convert("880:990:10", None, None) == tuple(float(w) for w in range(880, 991, 10))
     assert WAVELENGTHS.convert("880,0.9um", None, None) == pytest.approx((880.0, 900.0), rel=1e-12)
-
-
     assert len(WAVELENGTHS.convert("800:899.9:0.1", None, None)) == 1000
     assert WAVELENGTHS.convert("960:960:0.5", None, None) == (960.0,)
 

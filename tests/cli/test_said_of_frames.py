@@ -357,7 +357,12 @@ def test_settings_that_are_no_mapping(text: str, found: str, tmp_path: Path) -> 
     ("words", "exposed", "level", "templates"),
     [
         (["--noiseless", "--templates"], (None, None), (0.0, None), True),
-        (["--exptime", "7s", "--seed", "5", "--flat-spectrum", "white", "--level", "model"], (7.0, None), None, False),
+        (
+            ["--exptime", "7s", "--seed", "5", "--flat-spectrum", "white", "--level", "model"],
+            (7.0, None),
+            None,
+            False,
+        ),
         (["--airmass", "1.5", "--night"], (None, 1.5), None, False),
     ],
 )

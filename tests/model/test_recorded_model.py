@@ -234,7 +234,9 @@ def test_rounding_is_no_error_of_a_table(size: float, good: bool) -> None:
         return np.where(np.arange(count) % 3 == 0, 0.0, size)[np.newaxis]
 
     if good:
-        assert tabulate(rough, (0.0, 1.0), [900.0], fourth_derivative=0.0, tolerance=1e-20).values.shape[1] == 9
+        assert (
+            tabulate(rough, (0.0, 1.0), [900.0], fourth_derivative=0.0, tolerance=1e-20).values.shape[1] == 9
+        )
     else:
         with pytest.raises(ConvergenceError):
             tabulate(rough, (0.0, 1.0), [900.0], fourth_derivative=0.0, tolerance=1e-20)
@@ -340,7 +342,7 @@ def test_overrides_are_text_that_tells_of_itself() -> None:
         read_effects_override(text.replace("3.0", "3.5"))
     with pytest.raises(InputError, match="fwhm once"):
         read_effects_override("\n".join(known[2:-1]))
-    with pytest.raises(InputError, match="statement is \"config.written_effects"):
+    with pytest.raises(InputError, match=r'statement is "config\.written_effects'):
         read_effects_override("# mine\nconfig.written_effects = 'x'\nconfig.effects['tilt.angle'] = 1.0\n")
     with pytest.raises(InputError, match="without any effect"):
         read_effects_override("# nothing\n\n")
