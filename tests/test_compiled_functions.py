@@ -92,6 +92,8 @@ def test_a_relaxed_subkernel_is_put_into_what_calls_it() -> None:
         compiled_with = subkernel(lambda x: x, **options).targetoptions
         assert compiled_with["fastmath"]
         assert compiled_with.get("forceinline") or compiled_with.get("inline") == "always"
+        assert compiled_with["no_cpython_wrapper"]
+        assert compiled_with["no_cfunc_wrapper"]
 
 
 def test_every_function_is_compiled_once() -> None:

@@ -27,6 +27,12 @@ def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
     assert write_whole(path, "µm") == path
     assert path.read_bytes() == "µm".encode()
     assert list(tmp_path.iterdir()) == [path]
+    mask = os.umask(0o027)
+    try:
+        mode = write_whole(tmp_path / "new.txt", "a").stat().st_mode
+    finally:
+        os.umask(mask)
+    assert mode & 0o777 == 0o640
 
 
 def test_an_error_leaves_the_old_file(tmp_path: Path) -> None:

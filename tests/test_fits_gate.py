@@ -96,6 +96,13 @@ def test_sizes_beyond_the_file(tmp_path: Path) -> None:
         stream.truncate(2**31)
     with open(sparse, "rb") as stream, pytest.raises(FrameFormatError, match="2147483648 or more"):
         check_axes(stream, "somewhere")
+    with open(sparse, "wb") as stream:
+        stream.write(PRIMARY + b" " * 13_000_000)
+        stream.truncate(2 * 10**9)
+    most = 100 * 512 * sparse.stat().st_blocks
+    assert 2**30 < most < 2 * 10**9
+    with open(sparse, "rb") as stream, pytest.raises(FrameFormatError, match=f"up to {most}"):
+        check_axes(stream, "somewhere")
 
 
 def tiles(*axes: int) -> bytes:
@@ -137,6 +144,8 @@ def test_what_compress_has_packed_is_refused() -> None:
     with pytest.raises(FrameFormatError, match=r"\.Z"):
         check_axes(io.BytesIO(b"\x1f\x9d" + b"0" * 100), "somewhere")
     check_axes(io.BytesIO(b""), "somewhere")
+    with pytest.raises(FrameFormatError, match="NAXIS = 1000"):
+        check_axes(io.BytesIO(HOSTILE), "somewhere")
 
 
 FIRST = "SIMPLE  =                    T"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lsst.fringe_sim import compiled
+from lsst.fringe_sim import compiled, resources
 from lsst.fringe_sim.cli.progress import progress
 from lsst.fringe_sim.compiled import kernel, limit_threads, processors, run_shares, run_threaded, subkernel
 from lsst.fringe_sim.descriptions import (
@@ -38,6 +38,7 @@ from lsst.fringe_sim.resources import (
     number_of_values,
     parse_user_yaml,
     read_user_text,
+    read_user_yaml,
 )
 
 
@@ -70,6 +71,7 @@ def test_near_misses_and_long_lists() -> None:
 
 @pytest.mark.parametrize(
     "good", [1.0, None, 3, np.float32(2.0), np.arange(3), [1, 2.0], ((1, 2), (3, 4)), [np.zeros(2), np.zeros(2)],
+             [[[1, 2, 3], [4, 5, 6]], np.zeros((2, 3))],
              np.ma.masked_array([1.0, 2.0], [False, False]), iter(())]
 )  # fmt: skip
 def test_numbers_pass(good: Any) -> None:
@@ -215,6 +217,25 @@ def test_yaml_is_as_deep_and_as_long_as_it_may_be(tmp_path: Path) -> None:
         read_user_text(tmp_path / "a", "x", 4)
 
 
+@pytest.mark.parametrize(
+    ("letters", "good"), [("\U0001f600" * 20, True), ("a" * 20, True), ("a" * 21, False)]
+)
+def test_a_yaml_file_is_measured_in_characters(
+    letters: str, good: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of UTF-8 has up to four bytes."""
+    monkeypatch.setattr(resources, "LONGEST_USER_FILE", 20)
+    (tmp_path / "a").write_text(letters, encoding="utf-8")
+    if good:
+        assert read_user_yaml(tmp_path / "a", "x") == letters
+    else:
+        with pytest.raises(InputError, match="21 characters"):
+            read_user_yaml(tmp_path / "a", "x")
+    (tmp_path / "a").write_bytes(b"a" * 81)
+    with pytest.raises(InputError, match="81 bytes"):
+        read_user_yaml(tmp_path / "a", "x")
+
+
 # Threads
 
 
@@ -241,6 +262,13 @@ def test_shares_are_all_of_it(threads: int, count: int, least: int, number: int)
     assert len(parts) == number
     assert [item for first, last in sorted(parts) for item in range(first, last)] == list(range(count))
     assert max(last - first for first, last in parts) - min(last - first for first, last in parts) <= 1
+
+
+def test_two_threads_work_at_once() -> None:
+    """Each of two items is waited for by the other."""
+    together = threading.Barrier(2)
+    run_threaded(lambda item: together.wait(timeout=20.0), 2, 2)
+    assert not together.broken
 
 
 def test_one_thread_works_in_its_own() -> None:
@@ -308,6 +336,21 @@ def test_what_cannot_be_kept_is_compiled_anew(
     compiled._work_without_cache(SimpleNamespace(_cache=None), None)
 
 
+@pytest.mark.parametrize(
+    ("own", "for_all", "found"), [(1, None, 1), (1, 2, 2), (None, 2, 2), (None, None, None)]
+)
+def test_what_is_kept_for_all_is_looked_into_first(own: Any, for_all: Any, found: Any) -> None:
+    def kept(what: Any) -> Any:
+        return SimpleNamespace(load_overload=lambda *given: what, save_overload=None)
+
+    dispatcher = SimpleNamespace(_cache=kept(own))
+    compiled._work_without_cache(dispatcher, None if for_all is None else kept(for_all))
+    assert dispatcher._cache.load_overload("signature", "context") == found
+    dispatcher = SimpleNamespace(_cache=kept(own))
+    compiled._work_without_cache(dispatcher, kept(None))
+    assert dispatcher._cache.load_overload("signature", "context") == own
+
+
 def test_only_a_folder_that_is_there_is_looked_into(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What an image keeps for all is read where it cannot be written; it is found by its place, or there is none."""
     monkeypatch.setattr(compiled.numba.config, "CACHE_DIR", str(tmp_path))
@@ -317,6 +360,10 @@ def test_only_a_folder_that_is_there_is_looked_into(tmp_path: Path, monkeypatch:
     locator = compiled._cache_for_all()._impl_class._locator_classes[0]
     (tmp_path / Path(locator(shown, shown.__code__.co_filename).get_cache_path()).name).mkdir()
     assert compiled._kept_for_all(shown) is not None
+    monkeypatch.setattr(compiled.os, "access", lambda *_: True)  # numba itself looks there
+    assert compiled._kept_for_all(shown) is None
+    monkeypatch.setattr(compiled.numba.config, "CACHE_DIR", "")
+    assert compiled._kept_for_all(shown) is None
 
 
 # At the prompt

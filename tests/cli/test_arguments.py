@@ -51,8 +51,11 @@ def test_every_option_is_explained(name: str) -> None:
     assert silent == []
 
 
-TOLD = ("default", "is_eager", "multiple", "nargs", "required", "count")
-OF_TYPE = ("min", "max", "min_open", "max_open", "exists", "dir_okay", "choices")
+TOLD = (
+    *("default", "is_eager", "multiple", "nargs", "required", "count"),
+    *("is_flag", "expose_value", "show_default"),
+)
+OF_TYPE = ("min", "max", "min_open", "max_open", "exists", "file_okay", "dir_okay", "choices")
 
 
 def facts(item: click.Parameter) -> str:

@@ -1,13 +1,19 @@
 """A map against a night of frames, by the command: noisy frames of a sensor whose map is off, and is not."""
 
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
+import click
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
 
+from lsst.fringe_sim.algorithms import range_forecast, sky_response
+from lsst.fringe_sim.cli import fit_sky
 from lsst.fringe_sim.cli.main import run
+from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import ThicknessMap
 
 SIDE = 160
@@ -46,8 +52,8 @@ def test_a_map_is_moved_to_where_the_sky_is(tmp_path: Path, rng: np.random.Gener
             assert np.abs(left).max() < 4.0 * moved.sigma.max()
 
 
-def write_frame(path: Path, seed: int, side: int = SIDE, **cards: object) -> str:
-    hdu = fits.PrimaryHDU(np.random.default_rng(seed).normal(3e3, 50.0, (side, side)).astype(np.float32))
+def write_frame(path: Path, seed: int, rows: int = SIDE, columns: int = SIDE, **cards: object) -> str:
+    hdu = fits.PrimaryHDU(np.random.default_rng(seed).normal(3e3, 50.0, (rows, columns)).astype(np.float32))
     hdu.header.update(cards)
     hdu.writeto(path)
     return str(path)
@@ -77,8 +83,8 @@ def test_what_is_refused_before_any_work(
     path = write_map(tmp_path / "map.fits", TRUE_UM)
     changed = {name: value for name, value in cards.items() if name not in ("seed", "side")}
     side = SIDE if cards.get("side") is None else 64
-    first = write_frame(tmp_path / "a.fits", 1, side, **changed)
-    second = write_frame(tmp_path / "b.fits", 1 if "seed" in cards else 2, side, **changed)
+    first = write_frame(tmp_path / "a.fits", 1, side, side, **changed)
+    second = write_frame(tmp_path / "b.fits", 1 if "seed" in cards else 2, side, side, **changed)
     command = ["fit-sky", first, second, "--thickness", path, *options, "--out", str(tmp_path / "out")]
     assert run(command) != 0
     assert reason in capsys.readouterr().err
@@ -100,3 +106,79 @@ def test_a_range_alone_gets_the_number_of_frames(tmp_path: Path, capsys: pytest.
     assert run(["fit-sky", *frames, "--thickness", "17:13", "--out", str(tmp_path / "no")]) == 2
     assert run(["fit-sky", *frames, "--thickness", "1:900", "--out", str(tmp_path / "no")]) == 1
     assert not (tmp_path / "no").exists()
+
+
+def test_what_is_there_is_a_file_and_what_is_not_a_range(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even if its name has the sign of a range in it."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "13:17").write_text("")
+    (tmp_path / "map.fits").write_text("")
+    (tmp_path / "folder").mkdir()
+    (kind,) = (item.type for item in fit_sky.fit_sky.params if item.name == "thickness")
+    for text in ("13:17", "map.fits"):
+        assert kind.convert(text, None, None) == text
+    for given in ("13um:18000nm", (13.0, 18.0)):
+        assert kind.convert(given, None, None) == (13.0, 18.0)
+    for text in ("folder", "none.fits", "18:13", "a:b"):
+        with pytest.raises(click.BadParameter):
+            kind.convert(text, None, None)
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [([], None), (["--order-error", "0.1"], 0.1), (["--model-accuracy", "0.2"], 0.2),
+     (["--order-error", "0.1", "--model-accuracy", "0.2"], 0.1)],
+)  # fmt: skip
+@pytest.mark.parametrize("enough", [True, False])
+def test_a_map_is_searched_for_where_there_are_frames_enough(
+    options: list[str], error: float | None, enough: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the error of the model that is stated; the table of the sky reaches two orders beyond the range."""
+    asked: list[object] = []
+    spans: list[tuple[float, float]] = []
+    table = SimpleNamespace(frame=lambda grid: grid)
+
+    def response(model: FringeModel, sky: object, *, thickness_range_um: tuple[float, float]) -> object:
+        spans.append(thickness_range_um)
+        return SimpleNamespace(sky=lambda: table)
+
+    found = range_forecast.RangeForecast(0.01, 0.02, 12.0, 40, 1, 2 if enough else 3, 0.01)
+
+    def forecast(predict: Callable[[np.ndarray], np.ndarray], *rest: object) -> object:
+        np.testing.assert_array_equal(predict(np.arange(13.0, 14.0, 0.1)), np.arange(13.0, 14.0, 0.1))
+        assert rest[2:] == ((48, 64), 1000, 0.02)
+        return found
+
+    monkeypatch.setattr(sky_response, "sky_response", response)
+    monkeypatch.setattr(range_forecast, "frame_noise", lambda frame, options: (0.02, 1000))
+    monkeypatch.setattr(range_forecast, "forecast_of_range", forecast)
+    monkeypatch.setattr(
+        fit_sky, "_search", lambda search, *rest: asked.append(search.keywords.get("order_error"))
+    )
+    frames = [write_frame(tmp_path / f"{seed}.fits", seed, 48, 64) for seed in (1, 2)]
+    for number, (text, low, high) in enumerate((("13:17", 13.0, 17.0), ("6.5:7", 6.5, 7.0))):
+        command = ["fit-sky", *frames, "--setup", "monocam", "--thickness", text, *options]
+        assert run([*command, "--out", str(tmp_path / str(number))]) == 0
+        order = float(FringeModel.from_setup("monocam").fringe_order_um(960.0))
+        np.testing.assert_allclose(spans[-1], (low - 2.0 * order, high + 2.0 * order))
+    assert asked == ([error, error] if enough else [])
+
+
+def test_a_map_of_a_part_of_a_sensor_is_held_against_frames_of_that_part(tmp_path: Path, capsys) -> None:
+    part = fits.PrimaryHDU(np.linspace(13.0, 14.0, 48 * 64).reshape(48, 64))
+    part.header["DETSEC"] = "[101:164,201:248]"
+    part.writeto(tmp_path / "map.fits")
+    frames = [write_frame(tmp_path / f"{seed}.fits", seed, 48, 64) for seed in (1, 2)]
+    command = [
+        "fit-sky",
+        *frames,
+        "--setup",
+        "monocam",
+        "--thickness",
+        str(tmp_path / "map.fits"),
+        "--dry-run",
+    ]
+    assert run([*command, "--out", str(tmp_path / "out")]) == 0
+    assert capsys.readouterr().out.endswith("against 2 frames\n")

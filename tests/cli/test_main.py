@@ -11,7 +11,7 @@ import click
 import pytest
 
 from lsst.fringe_sim.cli.main import cli, run
-from lsst.fringe_sim.cli.parameters import EFFECT, SIZE, WAVELENGTHS, Quantity
+from lsst.fringe_sim.cli.parameters import EFFECT, SIZE, THICKNESS_RANGE, WAVELENGTHS, Quantity
 
 COMMANDS = cli.list_commands(click.Context(cli))
 
@@ -124,12 +124,29 @@ def test_bad_quantities_are_usage_errors(text) -> None:
 def test_wavelength_ranges_include_the_end() -> None:
     assert WAVELENGTHS.convert("880:990:10", None, None) == tuple(float(w) for w in range(880, 991, 10))
     assert WAVELENGTHS.convert("880,0.9um", None, None) == pytest.approx((880.0, 900.0), rel=1e-12)
+    assert len(WAVELENGTHS.convert("800:899.9:0.1", None, None)) == 1000
+    assert WAVELENGTHS.convert("960:960:0.5", None, None) == (960.0,)
 
 
-@pytest.mark.parametrize("text", ["880:990", "990:880:10", "880:990:0", "1:100000:0.1"])
+@pytest.mark.parametrize("text", ["880:990", "990:880:10", "880:990:0", "1:100000:0.1", "800:900:0.1"])
 def test_bad_wavelength_ranges_are_usage_errors(text) -> None:
     with pytest.raises(click.BadParameter):
         WAVELENGTHS.convert(text, None, None)
+
+
+def test_ranges_of_a_thickness() -> None:
+    assert THICKNESS_RANGE.convert("0.5:600nm", None, None) == pytest.approx((0.5, 0.6))
+    assert THICKNESS_RANGE.convert((7.0, 15.0), None, None) == (7.0, 15.0)
+    for text in ("0:1", "1:1", "2:1", "-1:1", "1:2:3", "1"):
+        with pytest.raises(click.BadParameter):
+            THICKNESS_RANGE.convert(text, None, None)
+
+
+@pytest.mark.parametrize("text", ["0x5", "5x0", "5x5x5", "x5", "5x", "axb", "5,5"])
+def test_sizes_without_two_sides_are_usage_errors(text: str) -> None:
+    assert SIZE.convert("1x1", None, None) == (1, 1)
+    with pytest.raises(click.BadParameter):
+        SIZE.convert(text, None, None)
 
 
 def test_sizes_and_effects() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -156,6 +157,22 @@ def test_a_fit_of_a_cube(tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
     )
     assert run(["fit", str(path), "--out", str(tmp_path / "b")]) == 1
     assert "good pixels of the thickness map is 0" in capsys.readouterr().err
+    for words, said in (
+        (["--method", "guo2022", "--zones", "halves"], "--zones"),
+        (["--silicon", "plane", "--contrast", "common"], "--contrast"),
+        (["--silicon", "plane", "--method", "guo2022"], "--silicon is 'plane'; allowed: fixed"),
+    ):
+        assert run(["fit", str(path), "--out", str(tmp_path / "c"), *words]) == 1
+        assert said in capsys.readouterr().err
+    for cards, words, status in (
+        ({}, ["--strict"], 0), ({"WORSTFLT": 900.0}, [], 0), ({"WORSTFLT": 900.0}, ["--strict"], 1),
+    ):  # fmt: skip
+        monkeypatch.setattr(
+            "lsst.fringe_sim.algorithms.thickness_fit.fit_thickness",
+            lambda *parts, cards=cards, **more: replace(made, metadata=cards),
+        )
+        assert run(["fit", str(path), "--out", str(tmp_path / "d"), "--overwrite", *words]) == status
+        assert ("--strict is 'a misfit'" in capsys.readouterr().err) == bool(status)
     few = cube_file(tmp_path, WAVELENGTHS_NM[:3])
     assert run(["fit", str(few), "--out", str(tmp_path / "c")]) == 1
     assert "number of wavelengths is 3; allowed: 4 or more" in capsys.readouterr().err
@@ -163,8 +180,6 @@ def test_a_fit_of_a_cube(tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
 
 def test_a_search_says_what_it_found(tmp_path: Path, capsys) -> None:
     """The summary, its notes, and the paths of all that was written."""
-    from dataclasses import replace
-
     found = replace(verdict(), notes=("one frame was left out",))
     discover._write(found, tmp_path, None, None, [])
     out, err = (text.replace(str(tmp_path), "…").splitlines() for text in capsys.readouterr())

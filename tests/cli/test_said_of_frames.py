@@ -12,6 +12,7 @@ from typing import Any
 import click
 import numpy as np
 import pytest
+from astropy.io import fits
 from small_pages import verdict
 
 from lsst.fringe_sim.algorithms import discovery, sky_frame
@@ -29,6 +30,7 @@ from lsst.fringe_sim.cli import (
 )
 from lsst.fringe_sim.cli.inputs import read_settings
 from lsst.fringe_sim.cli.lab_frames import LabSeries
+from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.cli.parameters import LABORATORY, SKY
 from lsst.fringe_sim.errors import FringeSimError, InputError
 from lsst.fringe_sim.instrument.bandpass import Bandpass
@@ -349,3 +351,64 @@ def test_settings_that_are_no_mapping(text: str, found: str, tmp_path: Path) -> 
     (tmp_path / "a.yaml").write_text(text)
     with pytest.raises(InputError, match=rf"a\.yaml: settings file is '{found}'"):
         read_settings(tmp_path / "a.yaml")
+
+
+@pytest.mark.parametrize(
+    ("words", "exposed", "level", "templates"),
+    [
+        (["--noiseless", "--templates"], (None, None), (0.0, None), True),
+        (
+            ["--exptime", "7s", "--seed", "5", "--flat-spectrum", "white", "--level", "model"],
+            (7.0, None),
+            None,
+            False,
+        ),
+        (["--airmass", "1.5", "--night"], (None, 1.5), None, False),
+    ],
+)
+def test_what_is_asked_of_a_simulation_of_the_sky(
+    words: list[str], exposed: Any, level: Any, templates: bool, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    """The simulation itself and the page are left out."""
+    asked: dict[str, Any] = {}
+
+    def keep(name: str, result: Any) -> Any:
+        return lambda *parts, **more: asked.setdefault(name, (*parts, more)) and result
+
+    monkeypatch.setattr(sky, "_response", keep("response", "response"))
+    monkeypatch.setattr(sky, "_frames", keep("frames", (["frame"], [{}])))
+    monkeypatch.setattr(sky, "_written", keep("written", ["frame"]))
+    monkeypatch.setattr(sky, "_write_templates", keep("templates", None))
+    monkeypatch.setattr(sky, "_said", lambda *parts: ["said"])
+    monkeypatch.setattr("lsst.fringe_sim.algorithms.coadd_sources.NightResults.of", lambda *parts: None)
+    monkeypatch.setattr("lsst.fringe_sim.report.sky_page.write_sky_report", keep("page", "page"))
+    thickness = tmp_path / "map.fits"
+    part = fits.Header({"DETSEC": "[101:124,201:220]"})
+    fits.writeto(thickness, np.linspace(14.0, 15.0, 20 * 24).reshape(20, 24), part)
+    setup = Setup.from_name("monocam")
+    sensor = setup.sensor()
+    command = ["sky", "--setup", "monocam", "--thickness", str(thickness), *words]
+    number = 11 if "--night" in words else 1
+    assert run([*command, "--out", str(tmp_path / "dry"), "--dry-run"]) == 0
+    said = f"would simulate {number} frames of {sensor.name}, 24 x 20 pixels"
+    assert capsys.readouterr().out.splitlines() == [said]
+    out = tmp_path / "out"
+    assert run([*command, "--out", str(out)]) == 0
+    assert capsys.readouterr().out.splitlines() == ["said", str(out), "page"]
+    exposure, common = asked["frames"][3:5]
+    assert (exposure.exptime_s, exposure.airmass) == (exposed[0], exposed[1] or setup.airmass)
+    assert (exposure.night is None, exposure.measured) == ("--night" not in words, "model" not in words)
+    assert (common["read_noise_e"], common["seed"]) == (
+        level or (sensor.read_noise, 5 if "--seed" in words else 1)
+    )
+    assert (common["detector"], common["physical_filter"]) == (sensor.name, setup.filter_name)
+    stem, cards = asked["written"][2:4]
+    assert stem == out / f"sky_{sensor.name}"
+    assert cards["INPUT0"].startswith("map.fits ")
+    assert cards["DETSEC"] == part["DETSEC"]
+    assert cards.get("FLATSPEC") == ("white" if "white" in words else None)
+    assert ("templates" in asked) is templates
+    if templates:
+        assert asked["templates"][3] == out / f"fringe_{sensor.name}"
+    assert asked["page"][0] == out / "report.html"
+    assert asked["page"][-1]["picture"] == out / "sky.png"

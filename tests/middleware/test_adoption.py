@@ -69,6 +69,22 @@ def test_again_changes_nothing_and_a_dry_run_stores_nothing(measured: Butler) ->
     assert (again.adopted, again.present) == ((), first)
 
 
+def test_the_first_collection_wins_and_those_of_the_camera_stay(measured: Butler) -> None:
+    """Datasets of the instrument itself, and of one that is not known here, are left alone."""
+    measured.collections.register("newer")
+    measured.registry.syncDimensionData("instrument", {"name": "Other", "class_name": "a.b"})
+    stand = {"instrument": "Other", "id": ON_STAND, "full_name": "S01", "purpose": "SCIENCE"}
+    measured.registry.syncDimensionData("detector", stand)
+    newer = thickness(number=9)
+    for instrument, detector in (("LSST-TS8", ON_STAND), ("LSSTCam", 94), ("Other", ON_STAND)):
+        measured.put(newer, "epoxyThickness", instrument=instrument, detector=detector, run="newer")
+    report = adopt(measured, collections=["newer", "lab"])
+    assert [ref.dataId["detector"] for ref in report.adopted] == [IN_CAMERA]
+    assert len(report.homeless) == 1
+    other = measured.get("epoxyThickness", instrument="LSSTCam", detector=IN_CAMERA, collections="camera")
+    assert other.value.tobytes() == newer.value.tobytes()
+
+
 def test_a_condition_limits_what_is_adopted(measured: Butler) -> None:
     with pytest.raises(InputError, match="none of a sensor of LSSTCam"):
         adopt(measured, where=f"instrument = 'LSST-TS8' AND detector = {NOT_IN_CAMERA}")

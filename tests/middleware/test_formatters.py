@@ -164,6 +164,7 @@ def test_verdicts_are_json(butler: Butler) -> None:
     ref = put(butler, verdict, "effectDiscovery", "FringeJson")
     assert butler.get(ref) == verdict
     assert json.loads(butler.getURI(ref).read()) == verdict
+    assert "µ".encode() in butler.getURI(ref).read()
     assert butler.getURI(ref).getExtension() == ".json"
 
 
@@ -204,7 +205,7 @@ class ExposureF:
         return self.metadata
 
     def getXY0(self) -> tuple[int, int]:
-        return 0, 0
+        return 3, 5
 
     def getDetector(self) -> None:
         return None
@@ -264,6 +265,7 @@ def test_exposure_becomes_the_same_fringe_frame(butler: Butler, with_afw: None) 
     back = frame_from_exposure(exposure)
     assert np.array_equal(back.image, frame.image)
     assert np.array_equal(back.mask, frame.mask)
+    assert back.xy0 == (3, 5)
     assert (back.physical_filter, back.creation_datetime) == (frame.physical_filter, frame.creation_datetime)
     y, x = np.argwhere(frame.mask == 0)[0]
     exposure.image.array -= frame_mean_without(frame, y, x)

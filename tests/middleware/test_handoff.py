@@ -97,6 +97,7 @@ def test_handoff_is_imported_elsewhere(
     rehearsal = invoke("write-fringe-handoff", certified, CALIB, tmp_path / "out", "--dry-run")
     assert "2 fringe frames would be written" in rehearsal.output
     assert not (tmp_path / "out").exists()
+    (tmp_path / "out").mkdir()
     result = invoke("write-fringe-handoff", certified, CALIB, tmp_path / "out")
     assert result.exit_code == 0, result.output
     exported = invoke("import", other_repo, tmp_path / "out", "--transfer", "copy")
@@ -115,9 +116,9 @@ def test_handoff_is_imported_elsewhere(
 
 def test_export_names_nothing_of_this_package(certified: Path, tmp_path: Path) -> None:
     with Butler.from_config(str(certified)) as butler:
-        refs = write_handoff(butler, RUN, tmp_path / "out", where="detector.raft = 'R11'")
+        refs = write_handoff(butler, RUN, tmp_path / "to" / "out", where="detector.raft = 'R11'")
     assert [ref.dataId["detector"] for ref in refs] == [37]
-    text = (tmp_path / "out" / "export.yaml").read_text()
+    text = (tmp_path / "to" / "out" / "export.yaml").read_text()
     assert "fringe_sim" not in text
     assert "FringeFrame" not in text
     kinds = [entry["type"] for entry in yaml.safe_load(text)["data"]]
@@ -128,8 +129,9 @@ def test_what_cannot_be_handed_off_is_refused(certified: Path, tmp_path: Path, i
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
     with Butler.from_config(str(certified)) as butler:
-        with pytest.raises(InputError, match=r"directory is .*; allowed: a new or an empty directory"):
-            write_handoff(butler, CALIB, tmp_path / "full")
+        for target in (tmp_path / "full", tmp_path / "full" / "file"):
+            with pytest.raises(InputError, match=r"directory is .*; allowed: a new or an empty directory"):
+                write_handoff(butler, CALIB, target)
         with pytest.raises(InputError, match=r"collection is 'nothing'; allowed: .*LSSTCam/calib/fringe"):
             write_handoff(butler, "nothing", tmp_path / "out")
         with pytest.raises(InputError, match="fringe frames is 0; allowed: at least one"):

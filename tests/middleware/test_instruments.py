@@ -50,6 +50,23 @@ def test_detectors_are_registered_with_their_places(butler: Butler, cls: type[In
         assert (record.purpose == "SCIENCE") == (detector.kind == "science")
 
 
+@pytest.mark.parametrize(
+    ("cls", "detectors", "exposures"),
+    [
+        (LsstCamFringe, 205, 8_000_000_000_000),
+        (MonoCamFringe, 1, 8_000_000_000_000),
+        (HscFringe, 1, 8_000_000_000_000),
+        (Ts8Fringe, 225, 10**15),
+    ],
+)
+def test_data_ids_are_packed_with_room_for_all(
+    butler: Butler, cls: type[Instrument], detectors: int, exposures: int
+) -> None:
+    """Numbers of detectors and exposures lie below those that the record of the instrument states."""
+    (record,) = butler.query_dimension_records("instrument", instrument=cls.getName())
+    assert (record.detector_max, record.exposure_max, record.visit_max) == (detectors, exposures, exposures)
+
+
 def test_a_raft_is_selected_by_name(butler: Butler) -> None:
     records = butler.query_dimension_records("detector", where="instrument='LSSTCam' AND detector.raft='R11'")
     assert sorted(r.id for r in records) == list(range(36, 45))

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from lsst.daf.butler import Butler
+from lsst.daf.butler import Butler, Timespan
 from recorded_numbers import Record
 from toy_repository import Invoke
 
@@ -78,6 +78,7 @@ def test_what_has_no_night_is_refused(butler: Butler) -> None:
         ({"exposure_time_s": 0.0}, OutOfRangeError),
         ({"exposure_time_s": float("inf")}, OutOfRangeError),
         ({"airmass": 0.9}, OutOfRangeError),
+        ({"airmass": 40.1}, OutOfRangeError),
         ({"airmass": float("nan")}, OutOfRangeError),
     ],
 )
@@ -85,6 +86,11 @@ def test_plans_that_make_no_sense_are_refused(changes: dict[str, object], error:
     values: dict[str, object] = {"date": DATE, "hours": (19.0,), **changes}
     with pytest.raises(error):
         NightPlan(**values)  # type: ignore[arg-type]
+
+
+def test_plans_at_the_edge_of_sense_are_taken() -> None:
+    for airmass in (1.0, 40.0):
+        assert NightPlan(DATE, (12.0, 35.99), exposure_time_s=0.01, airmass=airmass).airmass == airmass
 
 
 @given(first=st.integers(12, 30), count=st.integers(1, 50), step=st.sampled_from([0.1, 0.25, 0.5, 1.0, 2.0]))
@@ -111,10 +117,11 @@ def test_hours_that_cannot_be_read_are_refused(text: str) -> None:
 def test_exposure_without_time_or_night_is_refused(butler: Butler) -> None:
     define_night(butler, "LSSTCam", [NightPlan(DATE, (19.0,))])
     (record,) = butler.query_dimension_records("exposure", instrument="LSSTCam")
-    values = {**record.toDict(), "timespan": None}
-    without = butler.dimensions["exposure"].RecordClass(**values)
-    with pytest.raises(InputError, match="timespan is None"):
-        hour_of_night(without)
+    moment = record.timespan.begin
+    for span in (None, Timespan(None, moment), Timespan(moment, None)):
+        without = butler.dimensions["exposure"].RecordClass(**{**record.toDict(), "timespan": span})
+        with pytest.raises(InputError, match=r"timespan is .*; allowed: a begin and an end"):
+            hour_of_night(without)
     other = butler.dimensions["exposure"].RecordClass(**{**record.toDict(), "instrument": "LSST-TS8"})
     with pytest.raises(InputError, match="one on a telescope"):
         hour_of_night(other)

@@ -1,3 +1,4 @@
+import datetime
 import logging
 import os
 import shutil
@@ -16,11 +17,12 @@ from lsst.resources import ResourcePath
 from raw_frame_maker import LSSTCAM_HEADER, write_raw
 from toy_repository import Invoke
 
-from lsst.fringe_sim.errors import InputError
+from lsst.fringe_sim.errors import InputError, UnknownNameError
 from lsst.fringe_sim.instrument.raw_files import find_raw_files
 from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_header
 from lsst.fringe_sim.middleware import Ts8Fringe, get_cli_subcommands, raw_ingest
-from lsst.fringe_sim.middleware.night import airmass_of
+from lsst.fringe_sim.middleware.adoption import adopt_datasets
+from lsst.fringe_sim.middleware.night import NightPlan, airmass_of, define_night
 from lsst.fringe_sim.middleware.raw_ingest import IngestReport, ingest_raws
 from lsst.fringe_sim.middleware.translators import TRANSLATORS
 
@@ -170,7 +172,7 @@ def test_ingesting_again_changes_nothing(butler: Butler, tmp_path: Path) -> None
     assert (len(more.ingested), len(more.present)) == (1, 5)
 
 
-@pytest.mark.parametrize("overtaken", [1, 9])
+@pytest.mark.parametrize("overtaken", [1, 2, 9])
 def test_frames_that_another_process_stores_meanwhile(
     overtaken: int, repo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -191,9 +193,10 @@ def test_frames_that_another_process_stores_meanwhile(
 
     monkeypatch.setattr(raw_ingest, "_split_by_presence", overtake)
     with Butler.from_config(str(repo), writeable=True) as butler:
-        if overtaken == 1:
+        if overtaken < 3:
             report = ingest_raws(butler, [str(tmp_path / "raw")], transfer="copy")
-            assert (len(report.ingested), len(report.present), report.refused) == (3, 2, ())
+            stored = 2 * overtaken
+            assert (len(report.ingested), len(report.present), report.refused) == (5 - stored, stored, ())
             assert all(Path(butler.getURI(ref).ospath).is_file() for ref in raws(butler))
         else:
             monkeypatch.setattr(raw_ingest, "ATTEMPTS", 2)
@@ -219,6 +222,27 @@ def test_another_frame_in_the_same_place_is_refused(butler: Butler, tmp_path: Pa
     assert "another frame of exposure 201807241000453" in report.refused[0]
     assert {str(ref) for ref in raws(butler)} == before
     assert len(ingest_raws(butler, [str(second)], transfer=transfer, run="u/second").ingested) == 5
+
+
+def test_a_frame_whose_file_is_gone_is_there_already(butler: Butler, tmp_path: Path) -> None:
+    """A second ingest does not mend the repository."""
+    path = write_raw(tmp_path / "raw.fits")
+    ingest_raws(butler, [str(path)], transfer="copy")
+    (ref,) = raws(butler)
+    Path(butler.getURI(ref).ospath).unlink()
+    again = ingest_raws(butler, [str(path)], transfer="copy")
+    assert (len(again.ingested), len(again.present), again.refused) == (0, 1, ())
+
+
+def test_a_run_may_be_there_before_its_frames(butler: Butler, tmp_path: Path) -> None:
+    """That of a night of the sky, before any raw frame and after the first ones."""
+    path = str(write_raw(tmp_path / "raw.fits"))
+    for run in ("first", "second"):
+        butler.collections.register(run)
+        assert len(ingest_raws(butler, [path], run=run, transfer="copy").ingested) == 1
+    assert raw_ingest.raw_dataset_type(butler) == DatasetType(
+        "raw", ("instrument", "exposure", "detector"), "RawFrame", universe=butler.dimensions
+    )
 
 
 def test_bad_files_stay_out_and_the_others_go_in(butler: Butler, tmp_path: Path) -> None:
@@ -273,6 +297,10 @@ def test_instrument_that_is_not_registered_is_named(tmp_path: Path) -> None:
     path = write_raw(tmp_path / "raw.fits")
     with Butler.from_config(str(tmp_path / "repo"), writeable=True) as butler:
         (message,) = ingest_raws(butler, [str(path)]).refused
+        with pytest.raises(UnknownNameError, match="nothing is registered"):
+            define_night(butler, "LSSTCam", [NightPlan(datetime.date(2026, 11, 21), (20.0,))])
+        with pytest.raises(UnknownNameError, match="nothing is registered"):
+            adopt_datasets(butler, "epoxyThickness", ["lab"], "LSSTCam", "camera")
     assert "instrument is 'LSST-TS8'; allowed: one that the repository knows (there is none)" in message
     assert "lsst.fringe_sim.Ts8Fringe" in message
 

@@ -8,13 +8,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from lsst.daf.butler import Butler
+from lsst.daf.butler import Butler, Config
 from sqlalchemy.exc import OperationalError
 from toy_repository import Invoke
 
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.errors import InputError
-from lsst.fringe_sim.middleware.repository import open_repository, recover_repository
+from lsst.fringe_sim.middleware.repository import open_repository, prepare_repository, recover_repository
 
 pytestmark = pytest.mark.middleware
 
@@ -73,3 +73,18 @@ def test_what_cannot_be_recovered_is_refused_in_one_line(tmp_path: Path, repo: P
     assert result.exit_code == 1
     assert "registry is" in result.output
     assert "not a database" in result.output
+
+
+def test_a_repository_that_is_prepared_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One without files of its own, and one whose configuration is no local file, are refused and not changed."""
+    memory = "lsst.daf.butler.datastores.inMemoryDatastore.InMemoryDatastore"
+    Butler.makeRepo(str(tmp_path / "memory"), config=Config({"datastore": {"cls": memory}}))
+    Butler.makeRepo(str(tmp_path / "in_a_package"))
+    (tmp_path / "in_a_package" / "__init__.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    files = [tmp_path / name / "butler.yaml" for name in ("memory", "in_a_package")]
+    before = [file.read_bytes() for file in files]
+    for repo in (str(tmp_path / "memory"), "resource://in_a_package/butler.yaml"):
+        with pytest.raises(InputError, match="one with a file datastore and a local configuration"):
+            prepare_repository(repo)
+    assert [file.read_bytes() for file in files] == before

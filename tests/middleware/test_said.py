@@ -15,6 +15,7 @@ from product_makers import thickness
 from raw_frame_maker import LSSTCAM_HEADER, write_raw
 from toy_repository import Invoke, put_fringe
 
+from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.raw_frame import read_raw_header
 from lsst.fringe_sim.middleware import raw_ingest
 from lsst.fringe_sim.middleware.instruments import INSTRUMENTS, _warn_unprepared
@@ -167,6 +168,7 @@ def test_prepared_and_in_order(repo: Path, tmp_path: Path, say: Any) -> None:
     words = out[0].removeprefix("…/other: added ").split(", ")
     assert len(words) == len(set(words)) > 5
     assert "RawFrame" in words
+    assert not {"storageClasses", "datastore", "formatters"} & set(words)
     assert say("prepare-fringe-repo", other) == (0, ["…/other: nothing is missing"], [])
     assert say("recover-fringe-repo", repo) == (0, ["…/repo: the registry is in order"], [])
 
@@ -260,7 +262,10 @@ def test_the_repository_that_lacks_something_is_named(tmp_path: Path, caplog) ->
     config = ButlerConfig(str(tmp_path / "bare"))
     registry = SimpleNamespace(_butler=SimpleNamespace(_config=config))
     _warn_unprepared(registry)
-    assert f"prepare-fringe-repo {tmp_path / 'bare'}" in caplog.records[-1].getMessage().replace("//", "/")
+    said = caplog.records[-1].getMessage()
+    assert f"prepare-fringe-repo {tmp_path / 'bare'}" in said.replace("//", "/")
+    assert "without" in said
+    assert " formatters," not in said.partition("without")[2]
     config.configFile = None
     _warn_unprepared(registry)
     assert "prepare-fringe-repo REPO" in caplog.records[-1].getMessage()
@@ -272,6 +277,9 @@ def test_headers_that_are_of_no_instrument() -> None:
     for translator in TRANSLATORS.values():
         for known in ({"INSTRUME": "other"}, {}):
             assert not translator.can_translate(known)
+    for name, source in (("a.fits", "a.fits"), (None, "header")):
+        with pytest.raises(InputError, match=f"{source}: INSTRUME is"):
+            TRANSLATORS["ts8"]({"INSTRUME": "other"}, filename=name).to_exposure_id()
 
 
 def test_where_an_instrument_is_not_registered(tmp_path: Path) -> None:

@@ -2,7 +2,9 @@
 
 import dataclasses
 import hashlib
+import math
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 from recorded_numbers import Record
 
 from lsst.fringe_sim.effects import ImageGeometry
-from lsst.fringe_sim.errors import FrameFormatError, InputError, OutOfRangeError
+from lsst.fringe_sim.errors import ConvergenceError, FrameFormatError, InputError, OutOfRangeError
 from lsst.fringe_sim.instrument.setup import Setup
 from lsst.fringe_sim.model import FringeModel, ResponseTable, response_table, tabulate
 from lsst.fringe_sim.model.effects_override import (
@@ -189,6 +191,57 @@ def test_any_response_as_a_table(tolerance: float, recorded: Record) -> None:
     recorded([first, recorded_of])
 
 
+def test_a_fast_wave_as_a_table(recorded: Record) -> None:
+    """The first grid on which its fourth derivative is looked for does not resolve it."""
+
+    def wave(start: float, step: float, count: int) -> np.ndarray:
+        return np.sin(4000.0 * (start + step * np.arange(count)))[np.newaxis]
+
+    table = tabulate(wave, (2.0, 3.0), [900.0], tolerance=1e-3)
+    place = np.linspace(2.0, 3.0, 9973)
+    error = np.abs(table.lookup(place)[0] - np.sin(4000.0 * place)).max()
+    assert error <= table.interpolation_error <= 1e-3
+    recorded({"step": table.step_um, "error": table.interpolation_error})
+
+
+@pytest.mark.parametrize(("first", "factor"), [(1e3, 0.3), (10.0, 0.9 * 10.0**-0.25), (1.1, 0.8)])
+def test_a_grid_is_refined_as_its_error_asks(first: float, factor: float) -> None:
+    """By the fourth root of what the error is too large, from 0.3 to 0.8 at a time."""
+
+    def at_odds(start: float, step: float, count: int) -> np.ndarray:
+        """Zero at the nodes; between them as wrong as asked for on the first grid, and right on finer ones."""
+        wrong = np.zeros(count)
+        if not asked:
+            wrong[1::3] = first * 1e-6 / 1.125
+        asked.append(step)
+        return wrong[np.newaxis]
+
+    asked: list[float] = []
+    table = tabulate(at_odds, (0.0, 1000.0), [900.0], fourth_derivative=1e-12, tolerance=1e-6)
+    usual = (192.0 * 1e-6 / 1e-12) ** 0.25
+    own = 1000.0 / math.ceil(1000.0 / usual)
+    error = first + own**4 * 1e-6 / 1944.0
+    expected = own * max(0.3, min(0.8, 0.9 * error**-0.25))
+    assert expected == pytest.approx(factor * own, rel=0.02)
+    assert table.step_um == 1000.0 / math.ceil(1000.0 / expected)
+
+
+@pytest.mark.parametrize(("size", "good"), [(8e-15, True), (1.2e-14, False)])
+def test_rounding_is_no_error_of_a_table(size: float, good: bool) -> None:
+    """Nobody gets less than 1e-14, and nobody is refused for asking for less."""
+
+    def rough(start: float, step: float, count: int) -> np.ndarray:
+        return np.where(np.arange(count) % 3 == 0, 0.0, size)[np.newaxis]
+
+    if good:
+        assert (
+            tabulate(rough, (0.0, 1.0), [900.0], fourth_derivative=0.0, tolerance=1e-20).values.shape[1] == 9
+        )
+    else:
+        with pytest.raises(ConvergenceError):
+            tabulate(rough, (0.0, 1.0), [900.0], fourth_derivative=0.0, tolerance=1e-20)
+
+
 def test_a_cubic_is_its_own_table() -> None:
     """Splines through four points or more give it back, in single and in double precision, in any order of pixels."""
     table = ResponseTable(
@@ -210,7 +263,7 @@ def test_edges_of_a_table() -> None:
     for place in (1.0 - 4e-10, 5.0 + 4e-10):
         assert np.isfinite(table.frame(np.full((2, 3), place), 1)).all()
         assert np.isfinite(table.lookup(place)).all()
-    for place in (1.0 - 1e-6, 5.0 + 1e-6):
+    for place in (1.0 - 7.5e-10, 5.0 + 7.5e-10, 1.0 - 1e-6, 5.0 + 1e-6):
         for row in (0, 1):
             with pytest.raises(OutOfRangeError, match=r"1 to 5 \(range of the table\)"):
                 table.frame(np.array([[2.0, 3.0], [np.nan, place]]), row)
@@ -289,6 +342,8 @@ def test_overrides_are_text_that_tells_of_itself() -> None:
         read_effects_override(text.replace("3.0", "3.5"))
     with pytest.raises(InputError, match="fwhm once"):
         read_effects_override("\n".join(known[2:-1]))
+    with pytest.raises(InputError, match=r'statement is "config\.written_effects'):
+        read_effects_override("# mine\nconfig.written_effects = 'x'\nconfig.effects['tilt.angle'] = 1.0\n")
     with pytest.raises(InputError, match="without any effect"):
         read_effects_override("# nothing\n\n")
 
@@ -364,3 +419,12 @@ def test_tables_of_a_set_up(name: str) -> None:
     assert [value for key, value in cards.items() if key.startswith("TABLE")] == [
         f"{folder}/{file} {revision(folder, file)}" for folder, file in tables
     ]
+
+
+def test_a_telescope_of_ones_own_is_no_shipped_table() -> None:
+    own = Path(__file__).resolve().parents[2] / "doc" / "tutorials" / "own_sensor" / "ccd290" / "sky.yaml"
+    setup = Setup.from_name(str(own))
+    assert {folder for folder, _ in tables_of(setup)} == {"media", "sky"}
+    cards = table_cards(tables_of(setup), setup.files)
+    stated = {value.split()[0] for value in cards.values() if value.startswith("own/")}
+    assert {"own/telescope.yaml", "own/stack.yaml", "own/sky.yaml"} <= stated

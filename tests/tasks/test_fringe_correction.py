@@ -15,7 +15,7 @@ from lsst.pipe.base import Pipeline
 from observed_night import ObservedNight, observed_night
 from task_commands import Command
 
-from lsst.fringe_sim.algorithms.correction import AMPLIFIERS_UNKNOWN
+from lsst.fringe_sim.algorithms.correction import AMPLIFIERS_UNKNOWN, AmplifierGrid
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.middleware import MonoCamFringe
 from lsst.fringe_sim.middleware.afw import observed_from_exposure
@@ -37,6 +37,16 @@ def test_pipelines_leave_the_amplifiers_to_the_frame(camera: str) -> None:
     """Names of amplifiers would free their levels, which then take of the fringes what the default leaves to them."""
     graph = Pipeline.from_uri(f"{PIPELINES}/{camera}/fringeCorrection.yaml").to_graph()
     assert {each.config.grid for each in graph.tasks.values()} == {AMPLIFIERS_UNKNOWN}
+
+
+def test_amplifiers_of_one_row_or_column_need_one_number() -> None:
+    for given, grid in (
+        ({}, AMPLIFIERS_UNKNOWN),
+        ({"amplifier_columns": 8}, AmplifierGrid(1, 8)),
+        ({"amplifier_rows": 2}, AmplifierGrid(2, 1)),
+        ({"amplifier_rows": 2, "amplifier_columns": 8}, AmplifierGrid(2, 8)),
+    ):
+        assert ObservedFringeConfig(**given).grid == grid
 
 
 def frame_of(image: np.ndarray) -> ObservedFrame:
@@ -63,12 +73,15 @@ def test_templates_say_what_they_are_made_of(templates: FringeTemplates) -> None
     assert "CFGHASH" in templates.metadata
 
 
-def test_a_frame_is_corrected_once(night: ObservedNight, templates: FringeTemplates) -> None:
+def test_a_frame_is_corrected_once(
+    night: ObservedNight, templates: FringeTemplates, caplog: pytest.LogCaptureFixture
+) -> None:
     task = FringeCorrectionTask(config=FringeCorrectionConfig(amplifier_columns=2))
     made = task.run(frame_of(night.images[4]), templates, "frame 4")
     assert list(made.summary["name"]) == ["frame 4"]
     assert made.summary["structure_after"][0] < 0.6 * made.summary["structure_before"][0]
     assert made.corrected.metadata["FRINGCOR"] == 1
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
     with pytest.raises(InputError, match="FRINGCOR"):
         task.run(made.corrected, templates)
 

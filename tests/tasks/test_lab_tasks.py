@@ -108,7 +108,7 @@ def test_only_the_walk_doubts_the_orders_of_single_pixels(flats: list[FringeFlat
 
 def test_flats_that_are_not_of_the_total_absorption_are_refused(flats: list[FringeFlat]) -> None:
     """The published fit took 1 - R - T for the signal; these flats are not made of it, and no pixel is sure."""
-    with pytest.raises(InputError, match="good pixels of the thickness map"):
+    with pytest.raises(InputError, match=f"^{NAME}: good pixels of the thickness map is 0; allowed"):
         fit(flats, observable="total", range_um=[12.0, 14.5])
 
 
@@ -122,6 +122,9 @@ def test_missing_wavelengths_are_listed(flats: list[FringeFlat]) -> None:
 def test_too_few_wavelengths_are_refused(flats: list[FringeFlat]) -> None:
     with pytest.raises(InputError, match="number of wavelengths is 3; allowed: 4 or more"):
         fit(flats[:3])
+    nearly = dataclasses.replace(flats[3], wavelength_nm=flats[2].wavelength_nm + 2e-4)
+    with pytest.raises(InputError, match="number of wavelengths is 3; allowed: 4 or more"):
+        fit([*flats[:3], nearly])
 
 
 def test_a_failure_names_sensor_field_and_value_and_survives_the_way_between_processes() -> None:

@@ -168,6 +168,13 @@ def test_a_fit_has_its_flats_in_the_order_of_their_wavelengths() -> None:
     assert changed == inputs == {"flats": ("connection", [offered[number] for number in (2, 3, 1, 0)])}
 
 
+@pytest.mark.parametrize("silicon", ["fixed", "sensor"])
+def test_silicon_is_stored_where_it_is_fitted(silicon: str) -> None:
+    assert ("silicon" in EpoxyFitConnections(config=EpoxyFitConfig(silicon=silicon)).outputs) == (
+        silicon == "sensor"
+    )
+
+
 @pytest.mark.parametrize("both", [True, False])
 def test_a_fit_stores_the_silicon_if_there_is_one(both: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Flats are read when the fit asks for them."""

@@ -23,6 +23,7 @@ from lsst.fringe_sim.tasks import (
     SkyFringeSimConfig,
     SkyFringeSimTask,
 )
+from lsst.fringe_sim.tasks.fringe_forecast import FringeForecastConfig
 from lsst.fringe_sim.tasks.sky_fringe_sim import SkyExposure
 
 ROWS, COLUMNS = 12, 16
@@ -184,6 +185,20 @@ def test_a_map_of_another_layer_is_refused() -> None:
 def test_a_map_without_any_thickness_is_refused() -> None:
     with pytest.raises(InputError, match="no known thickness"):
         run(thickness(mask=np.full((ROWS, COLUMNS), mask_bits("NO_DATA"))))
+
+
+def test_the_light_of_the_flat_field_is_that_of_the_configuration() -> None:
+    known = thickness().known_um()
+    for given, name in (("white", "white"), ("gaussian:970:30", "gaussian:970:30"), (None, None)):
+        made = SkyFringeSimConfig(flat_spectrum=given).sky_model(DETECTOR, 1.2, known, {})
+        flat = made.spectrum().flat
+        assert (flat.name if flat else None) == name
+
+
+def test_every_sensor_has_a_forecast() -> None:
+    made = FringeForecastConfig(stand_in_shape=[20, 24]).map_of(None, DETECTOR)
+    assert made.value.shape == (20, 24)
+    SkyFringeSimConfig(setup="monocam").validate()  # photons do not migrate unless that is asked for
 
 
 @pytest.mark.parametrize(

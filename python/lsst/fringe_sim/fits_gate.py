@@ -154,7 +154,7 @@ def _refuse_endless(piece: bytes, source: str) -> None:
                 claimed = " ".join(piece[place : place + 30].decode("ascii", "replace").split())
                 allowed = "at most 999 axes or columns, and no negative size"
                 raise FrameFormatError("header", claimed, allowed, source=source)
-            place = piece.find(keyword, place + 1)
+            place = piece.find(keyword, place + len(keyword))
 
 
 def _most_bytes(stream: IO[bytes], source: str) -> int:

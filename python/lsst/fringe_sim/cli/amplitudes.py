@@ -62,7 +62,7 @@ def amplitudes(
     folder = out.prepare() if out is not None else None
     rows = [case for case in CASES if not cases or case.name in cases]
     table = compare_amplitudes(adhesive, skies, effects.settings, rows)
-    shown = table.copy(copy_data=False)
+    shown = table.copy()
     shown.remove_columns(["setup", "temperature", "layer"])
     click.echo("\n".join(shown.pformat(max_lines=-1, max_width=-1, align="<")))
     for sentence in table.meta["contradiction"]:

@@ -130,7 +130,7 @@ def fit_sky(
             _forecast(thickness, model, loaders, options, wrong, out)
         return
     layer = read_map(thickness, setup, sensor)
-    section = read_section(thickness, sensor, (layer.shape[0], layer.shape[1]))
+    section = read_section(thickness, sensor, layer.shape)
     model = placed_model(setup, sky_settings(effects.settings), sensor)
     order_um = float(model.fringe_order_um(960.0))
     _check_frames(loaders, images, layer, setup)

@@ -45,7 +45,7 @@ def _one_clear_message(command: Callable[..., None]) -> Callable[..., None]:
     return wrapped
 
 
-def _butler(repo: str, *, writeable: bool) -> contextlib.AbstractContextManager[Butler]:
+def _butler(repo: str, *, writeable: bool = False) -> contextlib.AbstractContextManager[Butler]:
     """Open a repository; what is none is refused in one line."""
     from .repository import open_repository
 
@@ -177,7 +177,7 @@ def write_fringe_handoff(repo: str, collection: str, directory: str, where: str,
     """
     from .handoff import write_handoff
 
-    with _butler(repo, writeable=False) as butler:
+    with _butler(repo) as butler:
         refs = write_handoff(butler, collection, directory, where=where, dry_run=dry_run)
     for ref in refs:
         click.echo(str(ref.dataId))

@@ -84,13 +84,7 @@ class IngestReport:
 
 def raw_dataset_type(butler: Butler) -> DatasetType:
     """Return the dataset type of raw frames."""
-    return DatasetType(
-        RAW,
-        ("instrument", "exposure", "detector"),
-        "RawFrame",
-        universe=butler.dimensions,
-        isCalibration=False,
-    )
+    return DatasetType(RAW, ("instrument", "exposure", "detector"), "RawFrame", universe=butler.dimensions)
 
 
 ATTEMPTS = 3  # How often frames are looked for and stored, if other processes store them at the same time

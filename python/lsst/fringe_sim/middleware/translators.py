@@ -68,7 +68,7 @@ class FringeTranslator(FitsTranslator):
     def can_translate(cls, header: Mapping[str, Any], filename: str | None = None) -> bool:
         """Whether the header is that of a raw frame of this instrument."""
         try:
-            return RawMetadata.from_header(header, source=filename or "header").camera == cls.camera_name
+            return RawMetadata.from_header(header, source="header").camera == cls.camera_name
         except InputError:
             return False
 

@@ -159,7 +159,7 @@ class ResponseTable(OneLine):
         def work(first: int, last: int) -> None:
             _frame_kernel(packed, self.start_um, 1.0 / self.step_um, image, first, last, filled, outside)
 
-        run_shares(work, len(image), max(1, _LEAST_PIXELS // max(image.shape[1], 1)))
+        run_shares(work, len(image), _LEAST_PIXELS // max(image.shape[1], 1))
         if filled is not out:
             out[:] = filled
         if np.any(outside):

@@ -50,7 +50,7 @@ class CameraConfig(Config):
                 raise FieldValidationError(field, self, str(self._refusal(kind, name, known)))
 
     def _refusal(self, kind: str, name: str, known: set[str]) -> InputError:
-        source = self.camera or None
+        source = self.camera
         here = _name_here(Camera.from_name(self.camera), kind, name) if self.camera else None
         if here:
             return InputError(kind, name, f"{here}, its name in data ids of this camera", source=source)

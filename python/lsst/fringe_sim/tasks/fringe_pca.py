@@ -141,7 +141,7 @@ class FringePcaTask(base.PipelineTask):
         self.log.info(
             "%s in %s: %d frames, components explain %s",
             *(first.detector, first.physical_filter, len(frames)),
-            ", ".join(f"{100 * share:.2f} %" for share in components.explained_variance_ratio[:4]),
+            ", ".join(f"{100 * share:.2f} %" for share in components.explained_variance_ratio),
         )
         return base.Struct(fringe=template, components=components)
 
@@ -179,10 +179,9 @@ def _numerical_errors(frames: Sequence[SkyFringe]) -> dict[str, float]:
 
 def _shared_metadata(frames: Sequence[SkyFringe]) -> dict[str, Any]:
     """What all frames say alike of how they were made: set-up, effects, lines; not whence a file came."""
-    first = frames[0].metadata
+    first, *others = (frame.metadata.items() for frame in frames)
     return {
         keyword: value
-        for keyword, value in first.items()
-        if not keyword.startswith("LSST BUTLER")
-        and all(keyword in frame.metadata and frame.metadata[keyword] == value for frame in frames)
+        for keyword, value in first
+        if not keyword.startswith("LSST BUTLER") and all((keyword, value) in other for other in others)
     }

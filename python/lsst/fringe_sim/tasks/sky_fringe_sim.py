@@ -230,7 +230,8 @@ class SkyFringeSimTask(base.PipelineTask):
 
     def _seed(self, exposure: SkyExposure, detector: Detector) -> int:
         sequence = np.random.SeedSequence([self.config.seed, exposure.exposure_id, detector.id])
-        return int(sequence.generate_state(1, np.uint64)[0] >> 1)
+        (state,) = sequence.generate_state(1, np.uint64)
+        return int(state >> 1)
 
 
 @functools.lru_cache(maxsize=4)

@@ -55,7 +55,7 @@ class SkyModel:
     laboratory_temperature_k: float | None = None  # at which it was measured, if it states that
     phase_sigma: float = 0.0  # of the adhesive between laboratory and sky [rad per 10 K]
     silicon_nodes_um: tuple[float, ...] | None = None  # thicknesses of the silicon; that of the stack without
-    flat_spectrum: str = ""  # light of the flat field, see `FlatSpectrum.from_name`
+    flat_spectrum: str | None = None  # light of the flat field, see `FlatSpectrum.from_name`
 
     def fringe_model(self) -> FringeModel:
         """Sensor behind the telescope."""
@@ -209,7 +209,7 @@ class SkyModelConfig(FringeModelConfig):
             vibrational_temperature_k=self.vibrational_temperature_k,
             thickness_range_um=thickness_span_um(thickness_um),
             laboratory_temperature_k=None if stated is None else to_number(LABORATORY_TEMPERATURE, stated),
-            flat_spectrum=self.flat_spectrum or "",
+            flat_spectrum=self.flat_spectrum,
         )
 
 
@@ -340,7 +340,7 @@ def _check_map(thickness: ThicknessMap, choice: ModelChoice) -> None:
             "effects on the sky",
             wanted,
             f"{on_sky}, with which the thickness was fitted",
-            source=thickness.detector or None,
+            source=thickness.detector,
         )
 
 
