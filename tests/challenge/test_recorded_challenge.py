@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -211,6 +212,25 @@ def test_visibility_of_a_case(
     cube, _ = expose(case.thickness_um, values, rng)
     names = tuple(dict.fromkeys(key.partition(".")[0] for key in values))
     recorded(visibility(replace(case, cube=cube, kind="two", names=names, values=values), most_cells=16))
+
+
+@pytest.mark.parametrize(("processors", "jobs", "threads"), [(7, 3, 2), (2, 2, 1), (1, 3, 1)])
+def test_cases_of_several_processes_share_the_processors(
+    processors: int, jobs: int, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They come as they are ready, and are those of one process."""
+    limits: list[int] = []
+    monkeypatch.setattr(run, "processors", lambda: processors)
+    monkeypatch.setattr(run, "limit_threads", limits.append)
+    monkeypatch.setattr(
+        run, "ProcessPoolExecutor", lambda n, _, start, given: ThreadPoolExecutor(n, "case", start, given)
+    )
+    monkeypatch.setattr(run, "_run_case", lambda kind, number, **_: result_of(number, kind))
+    counts = {"one": 3, "none": 2}
+    told: list[CaseResult] = []
+    assert run.run_challenge(counts, 5, jobs=jobs, progress=told.append) == run.run_challenge(counts, 5)
+    assert sorted(map(str, told)) == sorted(map(str, run.run_challenge(counts, 5).cases))
+    assert set(limits) == {threads}
 
 
 def test_names_in_any_order() -> None:

@@ -85,6 +85,7 @@ def rings(
         ((30, 44), (500.0, 900.0), 260.0),
         ((110, 36), (-700.0, 300.0), 330.0),
         ((104, 60), (1000.0, -900.0), 125.0),
+        ((190, 24), (1500.0, -1800.0), 130.0),
     ],
 )
 def test_rings_are_found_where_they_are(
@@ -280,3 +281,22 @@ def test_effects_on_a_system_that_has_them_already(recorded: Record) -> None:
         assert cone.beam.weight.sum() == pytest.approx(1.0)
     assert cones[1].beam.theta.max() > cones[0].beam.theta.max() > 0.9 * np.arcsin(0.2)
     recorded([[cone.beam.theta, cone.beam.weight] for cone in cones])
+
+
+def test_the_adhesive_turns_the_fringe_on_its_way_to_the_telescope() -> None:
+    """By so much for 10 K between the temperatures; in the laboratory neither of both effects is known."""
+    bench, sky = (FringeModel.from_setup(name).base_system for name in ("ts8_e2v", "lsst_e2v"))
+    adhesive, sensor = BY_NAME["epoxy_temperature"], BY_NAME["sensor_temperature"]
+    turned, warmer = {"phase_per_10k": 0.3}, {"offset": 5.0}
+    assert adhesive.change_system(bench, turned) is bench
+    assert sensor.change_system(bench, warmer) is bench
+    assert sensor.change_system(sky, warmer).temperature_k == sky.temperature_k + 5.0
+    colder = dataclasses.replace(sky, laboratory_temperature_k=sky.temperature_k + 17.0)
+    phase = []
+    for system in (colder, adhesive.change_system(colder, turned)):
+        layer = system.stack.layers[system.stack.position("adhesive")]
+        index = float(layer.medium.index(960.0, system.temperature_k).real)
+        phase.append(4.0 * np.pi * index * layer.thickness_um / 0.96)
+    assert phase[1] - phase[0] == pytest.approx(0.3 * 1.7)
+    alike = dataclasses.replace(sky, laboratory_temperature_k=sky.temperature_k)
+    assert adhesive.change_system(alike, turned) is alike

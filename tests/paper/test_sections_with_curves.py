@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -130,3 +131,22 @@ def test_a_section_on_hsc_with_another_response_is_as_recorded(
         monkeypatch.setattr(module, name, value)
     monkeypatch.setattr(sky, "sky_response", OneWave)
     recorded(sky.hsc(context if published else replace(context, shared=None)))
+
+
+def one_fit(cube: Any, model: Any, method: str, threads: int) -> Any:
+    """Stands in the place of fits that take seconds: a map that depends on all flats, off by orders in places."""
+    reach = {"guo2022": 6.0, "global": 4.0}[method] / model.effect_settings["contrast_loss.factor"]
+    off = reach * np.tensordot(0.5 ** np.arange(len(cube.image)), cube.image - 1.0, axes=1)
+    off[0, :5] = np.nan
+    return SimpleNamespace(value=e2v_321((64, 64))[:40, :44] + off)
+
+
+def test_a_section_on_fits_with_another_fit_is_as_recorded(
+    context: Context, recorded: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for (module, name), value in SMALLER.items():
+        monkeypatch.setattr(module, name, value)
+    monkeypatch.setattr(laboratory, "fit_thickness", one_fit)
+    made = laboratory.thickness_fit(context)
+    assert all(0.0 < value < 100.0 for value in made.values.values())
+    recorded(made)

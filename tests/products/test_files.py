@@ -18,6 +18,7 @@ from recorded_numbers import Record
 
 from lsst.fringe_sim.errors import FrameFormatError, InputError, UnknownNameError
 from lsst.fringe_sim.products import FringeCube, ThicknessMap, mask_bits
+from lsst.fringe_sim.products.thickness_map import THICKNESS_LIMITS_UM, UNKNOWN_SIGMA_UM
 
 KINDS = st.sampled_from(sorted(MAKERS))
 BLOCK = 2880
@@ -425,3 +426,64 @@ def test_a_map_of_ours_keeps_what_its_mask_only_doubts(tmp_path: Path) -> None:
     known = found.known_um()
     assert np.isnan(known[0, 0])
     assert known[1, 1] == product.value[1, 1]
+
+
+def foreign_parts(value: np.ndarray, **others: np.ndarray) -> fits.HDUList:
+    named = [fits.ImageHDU(array, name=name) for name, array in others.items()]
+    return fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(value, name="MAP"), *named])
+
+
+def test_pixels_of_a_map_from_elsewhere_that_mean_nothing_are_no_data(tmp_path: Path) -> None:
+    """No positive number, marked by its mask, or no uncertainty; one that is sure of itself is good."""
+    value, sigma, mask = np.full((5, 7), 14.0), np.full((5, 7), 2.0), np.zeros((5, 7), np.int32)
+    value[0, :4] = np.nan, 0.0, -3.0, np.inf
+    sigma[1, :4] = np.nan, -1.0, np.inf, 0.0
+    mask[4, 2:4] = 1, 4
+    hdus = foreign_parts(value, SIGMA=sigma, MASK=mask)
+    hdus["SIGMA"].header["BUNIT"] = "nm"
+    hdus.writeto(tmp_path / "map.fits")
+    found = ThicknessMap.read_any(tmp_path / "map.fits")
+    expected = np.zeros((5, 7), int)
+    expected[0, :4] = expected[1, :3] = expected[4, 2:4] = mask_bits("NO_DATA")
+    np.testing.assert_array_equal(found.mask, expected)
+    np.testing.assert_allclose(found.sigma[expected == 0], np.where(sigma == 0.0, 0.0, 2e-3)[expected == 0])
+    assert found.layer == "unknown"
+    foreign_parts(value, MASK=mask).writeto(tmp_path / "plain.fits")
+    plain = ThicknessMap.read_any(tmp_path / "plain.fits")
+    expected[1] = 0
+    np.testing.assert_array_equal(plain.mask, expected)
+    np.testing.assert_allclose(plain.sigma, UNKNOWN_SIGMA_UM)
+    assert not plain.chi2.any()
+    assert not plain.slip_probability.any()
+
+
+LOW_UM, HIGH_UM = THICKNESS_LIMITS_UM
+SOME = np.full((3, 4), 14.0)
+
+
+@pytest.mark.parametrize(
+    ("hdus", "message"),
+    [
+        (foreign_parts(SOME * LOW_UM / 14.0), ""),
+        (foreign_parts(SOME * HIGH_UM / 14.0), ""),
+        (foreign_parts(0.99 * SOME * LOW_UM / 14.0), "median of the thickness map"),
+        (foreign_parts(1.01 * SOME * HIGH_UM / 14.0), "median of the thickness map"),
+        (foreign_parts(SOME, SIGMA=0.34 * SOME / 14.0), ""),
+        (foreign_parts(SOME, SIGMA=0.36 * SOME / 14.0), "median of SIGMA"),
+        (foreign_parts(SOME, SIGMA=np.ones((4, 3))), "shape of SIGMA"),
+        (foreign_parts(SOME, MASK=np.ones((4, 3), np.int16)), "shape of MASK"),
+        (foreign_parts(SOME, MASK=np.ones((3, 4), np.int16)), "no finite pixel"),
+        (foreign_parts(SOME, SIGMA=np.full((3, 4), -1.0)), "good pixels of the thickness map is 0"),
+        (foreign_parts(np.ones((2, 3, 4))), "two-dimensional"),
+        (fits.HDUList([fits.PrimaryHDU()]), "no image"),
+    ],
+)
+def test_a_map_from_elsewhere_is_a_thickness_or_is_refused(hdus: Any, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "map.fits"
+    hdus.writeto(path)
+    if not message:
+        assert ThicknessMap.read_any(path).shape == (3, 4)
+        return
+    with pytest.raises(FrameFormatError, match=message) as caught:
+        ThicknessMap.read_any(path)
+    assert caught.value.source == str(path)

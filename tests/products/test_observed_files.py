@@ -11,6 +11,7 @@ from astropy.io import fits
 
 from lsst.fringe_sim.errors import FrameFormatError, InputError, MissingPackageError
 from lsst.fringe_sim.products import MASK_PLANES, describe_mask
+from lsst.fringe_sim.products.image_archive import archive_planes
 from lsst.fringe_sim.products.observed_files import detector_of, observed_images, write_images
 
 SHAPE = (12, 20)
@@ -224,3 +225,32 @@ def test_sensors_of_cameras_that_name_them_in_other_ways_are_not_one():
 def test_the_filter_of_hsc_is_read(tmp_path):
     path = write(tmp_path / "CORR.fits", fits.ImageHDU(IMAGE, fits.Header({"FILTER01": "HSC-Y"})))
     assert observed_images(path)[0].read().physical_filter == "HSC-Y"
+
+
+@pytest.mark.parametrize(
+    ("stated", "place"), [(1, 0), (2, 1), (1 << 30, 30), (0, None), (-2, None), (6, None)]
+)
+def test_planes_of_an_archive_are_powers_of_two(stated, place):
+    hdu = fits.ImageHDU(np.zeros(SHAPE, dtype=np.int32), name="MASK")
+    hdu.header["MSKN0007"], hdu.header["MSKM0007"] = "SATURATED", stated
+    hdus = fits.HDUList([fits.PrimaryHDU(), hdu, fits.ImageHDU(IMAGE, name="VARIANCE")])
+    if place is None:
+        with pytest.raises(FrameFormatError, match="MSKM0007"):
+            archive_planes(hdus)
+    else:
+        ((stored, bits),) = archive_planes(hdus)
+        assert (stored.shape, bits) == (SHAPE, {"SAT": place})
+
+
+def test_a_card_of_nothing_is_taken_out_if_it_is_there(tmp_path):
+    source = write(
+        tmp_path / "in.fits", fits.ImageHDU(IMAGE, fits.Header({"GONE": 1, "STAYS": 2}), name="SCI")
+    )
+    write_images(
+        source, tmp_path / "out.fits", {1: IMAGE + 1.0}, {1: {"GONE": None, "NEVER": None, "NEW": 3}},
+        {1: np.zeros(SHAPE, bool)}, {},
+    )  # fmt: skip
+    with fits.open(tmp_path / "out.fits") as hdus:
+        assert len(hdus) == 2
+        assert ("GONE" in hdus[1].header, hdus[1].header["STAYS"], hdus[1].header["NEW"]) == (False, 2, 3)
+        np.testing.assert_array_equal(hdus[1].data, IMAGE + 1.0)

@@ -56,6 +56,7 @@ def test_counts_become_electrons_without_the_bias(flats: Path, electrons: np.nda
     np.testing.assert_array_equal(cube.wavelength_nm, WAVELENGTHS_NM)
     np.testing.assert_allclose(cube.image, electrons, rtol=1e-5)
     np.testing.assert_allclose(cube.variance, electrons + 1.5 * 25.0, rtol=1e-5)
+    np.testing.assert_array_equal(cube.exposures.dark_time_s, 0.0)  # no EXPTIME: not known
 
 
 def test_pixels_without_a_number_and_full_ones_are_masked(tmp_path: Path) -> None:

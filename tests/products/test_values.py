@@ -11,9 +11,10 @@ from astropy.table import Table
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from product_makers import MAKERS, cube, flat, masks, pixels, sky
+from product_makers import MAKERS, cube, flat, masks, pixels, sky, templates, thickness
 
 from lsst.fringe_sim.errors import FrameFormatError, InputError, OutOfRangeError, UnknownNameError
+from lsst.fringe_sim.model import Setup
 from lsst.fringe_sim.products import (
     MASK_PLANES,
     FlatExposures,
@@ -23,7 +24,10 @@ from lsst.fringe_sim.products import (
     mask_bits,
 )
 from lsst.fringe_sim.products.flat_fit import FlatFit
+from lsst.fringe_sim.products.fringe_templates import input_cards, made_of
 from lsst.fringe_sim.products.mask import ALL_BITS, planes_from_header, remap_mask
+from lsst.fringe_sim.products.observed_frame import observed_from_simulation
+from lsst.fringe_sim.products.thickness_map import thickness_span_um
 
 GOOD = np.zeros((3, 4), dtype=int)
 
@@ -433,3 +437,95 @@ def test_what_stands_for_what_frames_of_the_sky_do_not_say() -> None:
     for frame in made.frames:
         assert (frame.exposure_s, frame.airmass, frame.seed, frame.quadrature_error) == (30.0, 1.2, None, 0.0)
         assert not frame.mask.any()
+
+
+@pytest.mark.parametrize("unit", ["electron", "fraction"])
+def test_a_simulated_frame_is_observed_in_electrons(unit: str) -> None:
+    image = 2700.0 * (1.0 + 0.01 * pixels((3, 4), 2)) if unit == "electron" else 0.01 * pixels((3, 4), 2)
+    frame = sky(unit=unit, image=image, mask=GOOD, mean_electrons=2500.0, metadata={"QONE": 3})
+    seen = observed_from_simulation(frame)
+    expected = image if unit == "electron" else 2500.0 * (1.0 + image)
+    np.testing.assert_allclose(seen.image, expected, rtol=1e-6)
+    assert (seen.unit, seen.detector, seen.physical_filter) == ("electron", "R22_S11", "y_10")
+    assert seen.metadata["QONE"] == 3
+    assert seen.variance is None
+
+
+def test_one_flat_twice_is_refused() -> None:
+    """Two of one wavelength have noise of their own; equal ones of several wavelengths are somebody's model."""
+    exposures = FlatExposures(np.array([960.0, 960.0]), np.array(2.0), np.array(183.0))
+    image = 20_000.0 * (1.0 + pixels((2, 3, 4), 4))
+    assert cube(image=image, exposures=exposures).shape == (2, 3, 4)
+    same = np.stack([image[0], image[0]])
+    with pytest.raises(InputError, match="equal pixels in 0 and 1"):
+        cube(image=same, exposures=exposures)
+    assert cube(image=same).shape == (2, 3, 4)
+
+
+def test_templates_are_frames_of_mean_zero_where_they_are_good() -> None:
+    """What a mask only doubts keeps its value, and has no part in the mean."""
+    mask = np.zeros((3, 4), np.int32)
+    mask[0], mask[1, 0] = mask_bits("NO_DATA"), mask_bits("SAT")
+    made = templates(mask=mask, physical_filter="", coverage=np.ones((3, 4), np.float32))
+    for number, (frame, pattern) in enumerate(zip(made.frames(), made.patterns, strict=True)):
+        level = pattern[mask == 0].mean(dtype=float)
+        np.testing.assert_allclose(frame.image[1:], pattern[1:] - level, atol=1e-7)
+        np.testing.assert_array_equal(frame.image[0], 0.0)
+        assert (frame.metadata["TEMPLATE"], frame.physical_filter) == (number, "unknown")
+    nothing = templates(mask=np.full((3, 4), mask_bits("NO_DATA")))
+    assert not any(frame.image.any() for frame in nothing.frames())
+
+
+def test_a_template_knows_its_frames() -> None:
+    digests = [f"{number:032x}" for number in range(3)] + ["f" * 32]
+    cards = {**input_cards(digests[1:]), "OTHER": digests[0][:16]}
+    assert [made_of(cards, digest) for digest in ("e" * 32, "f" * 15 + "0" * 17, "f" * 16 + "0" * 16)] == [
+        False, False, True
+    ]  # fmt: skip
+    assert not made_of({"OTHER": "f" * 16}, "f" * 32)
+    assert cards["INPUT2"] == "f" * 16
+
+
+def test_the_span_of_a_map_is_that_of_what_is_known() -> None:
+    value = np.array([[np.nan, 13.5], [14.25, 14.0]])
+    assert thickness_span_um(value, 0.25) == (13.25, 14.5)
+    assert thickness_span_um(value, 20.0) == (0.0, 34.25)
+    assert thickness_span_um(value) == pytest.approx((13.499, 14.251), abs=1e-9)
+    with pytest.raises(InputError, match="no known thickness"):
+        thickness_span_um(np.full((2, 2), np.nan))
+
+
+def test_a_map_is_of_a_layer_and_of_a_vendor() -> None:
+    of_e2v = Setup.from_name("ts8_e2v")
+    fitted = thickness(layer="adhesive", detector="R22_S11")
+    assert fitted.of_setup(of_e2v) is fitted
+    assert thickness(layer="detection").of_setup(of_e2v, layer="detection").layer == "detection"
+    with pytest.raises(
+        InputError, match=r"here.*layer of the thickness map is 'detection'; allowed: adhesive"
+    ):
+        thickness(layer="detection").of_setup(of_e2v, "here")
+    with pytest.raises(InputError, match="R22_S11"):
+        thickness(layer="detection", detector="R22_S11").of_setup(of_e2v)
+    assert fitted.contrast_sigma is None
+
+
+@pytest.mark.parametrize(
+    ("levels", "refused"),
+    [((0.51, 1.0), False), ((1.99, 0.1), False), ((0.5, 1.0), True), ((2.0, 1.0), True), ((0.0, 1.0), True)],
+)
+def test_relative_counts_are_those_over_their_mean(levels: tuple[float, float], refused: bool) -> None:
+    """The first flat with good pixels tells, by the median of these."""
+    image = np.full((3, 3, 4), 1.0)
+    image[0], image[1], image[2] = -5.0, levels[0], levels[1]
+    mask = np.zeros((3, 3, 4), np.int16)
+    mask[0], mask[1, :2] = 1, 1
+    image[1, :2] = 7.0
+    exposures = FlatExposures(np.array([950.0, 960.0, 970.0]), np.array(2.0), np.array(183.0))
+    fields = {"unit": "relative", "mask": mask, "variance": np.ones(image.shape), "exposures": exposures}
+    if refused:
+        with pytest.raises(OutOfRangeError, match="counts over their mean"):
+            cube(image=image, **fields)
+    else:
+        assert cube(image=image, **fields).unit == "relative"
+    nothing = {**fields, "mask": np.ones(image.shape, np.int16)}
+    assert cube(image=image, **nothing).unit == "relative"

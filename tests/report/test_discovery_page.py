@@ -20,6 +20,7 @@ from lsst.fringe_sim.algorithms.discovery import Verdict, discover
 from lsst.fringe_sim.algorithms.discovery.verdict import Gap, NamedEffect, ParameterValue, Step, Where
 from lsst.fringe_sim.algorithms.flat_residual import FlatResidual, ResidualPair, residual_pair
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
+from lsst.fringe_sim.effects.learned import LEARNED_NODES_NM
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.model.effects_override import is_as_written, read_effects_override
 from lsst.fringe_sim.products import FlatExposures, ThicknessMap
@@ -331,6 +332,24 @@ def test_what_was_learned_is_told_and_shown(name: str, recorded: Record) -> None
     assert "812" in told
     assert told.index("3 % of the fringes") < told.index("No name")
     assert list(downloads(text)["discovery_learned"]["rms"]) == pytest.approx([0.78, 0.71, 0.70])
+
+
+@pytest.mark.parametrize(
+    ("count", "panels", "inch"), [(3, 3, (9.0, 2.6)), (6, 6, (12.0, 5.2)), (14, 12, (12.0, 7.8))]
+)
+def test_patterns_of_many_wavelengths_stand_in_rows_of_four(
+    count: int, panels: int, inch: tuple[float, float]
+) -> None:
+    nodes = LEARNED_NODES_NM[:count]
+    own = {f"learned_light.at_{node}_y1x2": 1e-3 * (1 + k) for k, node in enumerate(nodes)}
+    made = learned_figure({"name": "learned_light", "own": own})
+    assert made.get_size_inches() == pytest.approx(inch)
+    shown = [axes for part in made.subfigs for axes in part.axes if axes.images]
+    assert [axes.get_title() for axes in shown] == [f"{node} nm" for node in nodes[:panels]]
+    reach = [axes.images[0].get_clim()[1] for axes in shown]
+    np.testing.assert_allclose(np.divide(reach, reach[0]), 1.0 + np.arange(panels), rtol=1e-9)
+    for axes, high in zip(shown, reach, strict=True):
+        assert np.abs(axes.images[0].get_array()).max() == pytest.approx(high)
 
 
 def test_a_disagreement_within_the_accuracy_is_said_to_be_so(tmp_path: Path) -> None:

@@ -1,14 +1,19 @@
 """What the pictures of pages show, and do not."""
 
+import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from astropy.table import Table
+from small_pages import verdict
 
+from lsst.fringe_sim.algorithms.discovery.verdict import MOST_CANDIDATES
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.report.correction_page import frame_figure
-from lsst.fringe_sim.report.discovery_figures import where_figure
+from lsst.fringe_sim.report.discovery_figures import candidates_figure, where_figure
+from lsst.fringe_sim.report.discovery_page import discovery_page
 from lsst.fringe_sim.report.focal_plane_page import focal_plane_figure
 from lsst.fringe_sim.style import figure, panels, show_image, to_png
 
@@ -35,7 +40,7 @@ def test_large_offsets_of_amplifiers_stay_inside_their_boxes() -> None:
     assert said == ["+0.3", "-34.5", "+601"]
 
 
-@pytest.mark.parametrize(("largest", "scale"), [(29.0, "linear"), (3000.0, "symlog")])
+@pytest.mark.parametrize(("largest", "scale"), [(30.0, "linear"), (31.0, "symlog"), (3000.0, "symlog")])
 def test_wavelengths_of_any_misfit_have_visible_bars(largest: float, scale: str) -> None:
     """Where one wavelength is a thousand times worse than noise, the others are still to be seen."""
     rows = [
@@ -51,6 +56,38 @@ def test_wavelengths_of_any_misfit_have_visible_bars(largest: float, scale: str)
     assert (bottom, top > largest) == (0.0, True)
     heights = [axes.transData.transform((900.0, value))[1] for value in (0.0, 1.0, top)]
     assert heights[1] - heights[0] > 0.02 * (heights[2] - heights[0])
+    if scale == "symlog":
+        assert axes.yaxis.get_transform().linthresh == 1.0  # up to the noise it is linear
+
+
+@pytest.mark.parametrize(("tenths", "scale"), [(300, "linear"), (310, "symlog"), (3200, "symlog")])
+def test_chances_of_any_size_are_drawn(tenths: int, scale: str) -> None:
+    """Those below a thousandth stand out; what is not known is no disagreement."""
+    chances = [0.5, 2e-3, 0.5e-3, None, math.nan, 10.0 ** (-0.1 * tenths)]
+    rows = [{"name": f"test {number}", "probability": chance} for number, chance in enumerate(chances)]
+    where = SimpleNamespace(amplifier=[], wavelength=[], thickness_phase=[], channels=rows)
+    axes = where_figure(SimpleNamespace(where=where)).axes[0]  # type: ignore[arg-type]
+    widths = [0.30103, 2.69897, 3.30103, 0.0, 0.0, min(0.1 * tenths, 300.0)]
+    np.testing.assert_allclose([bar.get_width() for bar in axes.patches], widths, atol=1e-5)
+    colours = [bar.get_facecolor() for bar in axes.patches]
+    assert [colour == colours[-1] for colour in colours] == [False, False, True, False, False, True]
+    assert axes.get_xscale() == scale
+    assert axes.get_xlim()[0] == 0.0
+    assert axes.yaxis_inverted()
+    if scale == "symlog":
+        assert axes.xaxis.get_transform().linthresh == 3.0  # up to the limit it is linear
+
+
+@pytest.mark.parametrize(("count", "bars"), [(0, 3), (2, 3), (3, 3), (7, 7), (40, MOST_CANDIDATES)])
+def test_the_figure_of_candidates_has_room_for_those_that_promise_something(count: int, bars: int) -> None:
+    candidates = [{"name": f"effect {k}", "score": 0.4 / (1 + k), "degrees": 1} for k in range(count)]
+    told = replace(verdict(), candidates=(*candidates, {"name": "none", "score": 0.0, "degrees": 1}))
+    assert candidates_figure(told).get_size_inches() == pytest.approx((6.4, 1.2 + 0.27 * bars))
+    if count > 2:
+        return
+    page = discovery_page(told).to_html()
+    assert ("None promises anything" in page) is (count == 0)
+    assert ("The most promising effects" in page) is (count > 0)
 
 
 def test_a_focal_plane_without_cells_is_refused() -> None:

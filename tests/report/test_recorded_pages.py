@@ -52,7 +52,7 @@ from lsst.fringe_sim.report.words import (
 )
 
 Seen = Callable[[Path], dict[str, Any]]
-SIDE = 24
+SIDE, ROWS = 24, 20
 SENSOR = Camera.from_name("lsstCam").detector("R22_S11")
 SECTION = SensorSection(SENSOR, (100, 100 + SIDE - 1), (2, 2 + SIDE - 1))
 
@@ -64,7 +64,9 @@ def waves(*shape: int) -> np.ndarray:
 
 def slipped_map() -> ThicknessMap:
     """A wedge of which some pixels may be a fringe order off, with what the fit says of each flat."""
-    one, count = smooth_map(), len(WAVELENGTHS_NM)
+    whole, count = smooth_map(), len(WAVELENGTHS_NM)
+    images = ("value", "sigma", "chi2", "slip_probability", "mask")
+    one = replace(whole, **{name: getattr(whole, name)[:ROWS] for name in images})
     flats = FlatFit(
         np.array(WAVELENGTHS_NM), *(10.0**-k * (1.5 + waves(count)) for k in (0, 2, 0, 1)), 2.0 + waves(count)
     )
@@ -72,18 +74,19 @@ def slipped_map() -> ThicknessMap:
         "CONTRAST": 0.93, "CONTRSIG": 0.02, "SCALESIG": 1e-4, "CELLMISF": 3.0, "WORSTFLT": 920.0, "WORSTOFF": 0.4,
         "WORSTSIG": 8.0, "ORDMARG": 2.0, "METHOD": "global",
     }  # fmt: skip
-    chance = np.clip(0.05 * waves(SIDE, SIDE), 1e-14, 1.0)
-    contrast = 1.0 + 0.1 * waves(4, 4)
+    chance = np.clip(0.05 * waves(ROWS, SIDE), 1e-14, 1.0)
+    contrast = 1.0 + 0.1 * waves(5, 6)
     return replace(one, slip_probability=chance, flats=flats, contrast_map=contrast, metadata=metadata)
 
 
 def thickness_page(folder: Path) -> Path:
     fitted, model = slipped_map(), FringeModel.from_setup("ts8_e2v")
-    counts = 1e4 * (1.0 + 0.02 * waves(len(WAVELENGTHS_NM), SIDE, SIDE))
+    counts = 1e4 * (1.0 + 0.02 * waves(len(WAVELENGTHS_NM), ROWS, SIDE))
     mask = np.zeros(counts.shape, np.int32)
     mask[2, 10:] = 1
     cube = FringeCube.from_arrays(counts, WAVELENGTHS_NM, variance=2.0 * counts, mask=mask)
-    return write_thickness_report(folder, cube, fitted, model, "guo2022", section=SECTION)
+    section = replace(SECTION, y=(2, 2 + ROWS - 1))
+    return write_thickness_report(folder, cube, fitted, model, "guo2022", section=section)
 
 
 def sky_page(folder: Path) -> Path:
@@ -127,7 +130,8 @@ def templates_page(folder: Path) -> Path:
     seen[:, :3] = 1
     even = templates((SIDE, SIDE), 2, mask=seen)
     even = replace(even, coverage=np.full((SIDE, SIDE), 4, np.float32), physical_filter="")
-    made = [("S1", templates((SIDE, SIDE))), ("", even)]
+    seen_often = np.tile(np.arange(SIDE, dtype=np.float32), (SIDE, 1))
+    made = [("S1", templates((SIDE, SIDE), coverage=seen_often)), ("", even)]
     return write_templates_report(folder / "templates.html", made)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -55,6 +56,7 @@ def visibility(case: SealedCase, *, most_cells: int = 20_000) -> Visibility:
     complete = _fit_with(problem, case, case.names, thickness)
     order = float(model.fringe_order_um(float(np.median(problem.cells.wavelength_nm))))
 
+    @cache
     def gain_over(names: tuple[str, ...]) -> float:
         shifted = (_fit_with(problem, case, names, thickness + number * order) for number in ORDERS)
         best = min(shifted, key=lambda fit: fit.chi2)
@@ -69,11 +71,8 @@ def visibility(case: SealedCase, *, most_cells: int = 20_000) -> Visibility:
         fine = replace(problem.with_cells(noiseless), basis=CellBasis(noiseless.shape[1:]))
         return _fit_with(fine, case, names, problem.basis.expand(complete.field)).chi2
 
-    together = gain_over(())
-    if len(case.names) == 1:
-        return Visibility(together, {case.names[0]: together})
     each = {name: gain_over(tuple(n for n in case.names if n != name)) for name in case.names}
-    return Visibility(together, each)
+    return Visibility(gain_over(()), each)
 
 
 def _at_cells(image: FloatArray, cells: CellData) -> FloatArray:

@@ -48,8 +48,8 @@ class Discs:
         """Discs about the cells with and without data; ``ratio``: of a radius over the one before."""
         shape = (seen.shape[0], seen.shape[1])
         largest = LARGEST_PART * min(shape)
-        number = math.floor(math.log(max(largest / SMALLEST_RADIUS, 0.5)) / math.log(ratio)) + 1
-        radii = [SMALLEST_RADIUS * ratio**step for step in range(max(number, 0))]
+        number = math.floor(math.log(largest / SMALLEST_RADIUS) / math.log(ratio)) + 1
+        radii = [SMALLEST_RADIUS * ratio**step for step in range(number)]
         rows, columns = (next_fast_len(side + math.ceil(largest), real=True) for side in shape)
         away = _distance((rows, columns))
         transforms = [rfft2((away <= radius).astype(float)) for radius in radii]

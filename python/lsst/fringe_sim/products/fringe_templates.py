@@ -99,13 +99,13 @@ class FringeTemplates(FitsProduct):
 
     def frames(self) -> list[FringeFrame]:
         """The templates one by one, as a correction takes them and as ``ip_isr`` reads them."""
-        good = (self.mask & mask_bits("NO_DATA")) == 0
+        good, known = self.mask == 0, (self.mask & mask_bits("NO_DATA")) == 0
         made = []
         for number, (pattern, variance) in enumerate(zip(self.patterns, self.variance, strict=True)):
             level = pattern[good].mean(dtype=np.float64) if good.any() else 0.0
             made.append(
                 FringeFrame(
-                    image=np.where(good, pattern - level, 0.0).astype(np.float32),
+                    image=np.where(known, pattern - level, 0.0).astype(np.float32),
                     mask=self.mask,
                     variance=variance,
                     physical_filter=self.physical_filter or "unknown",

@@ -74,9 +74,7 @@ def write_paper_page(
 def _summary(made: Reproduction, open_points: Sequence[Finding]) -> list[tuple[str, str]]:
     """How many numbers agree, and how far off the others are."""
     stated = [(f.value, 0.5 * (f.number.low + f.number.high)) for f in open_points]
-    off = [
-        abs(value / middle - 1.0) for value, middle in stated if np.isfinite(value + middle) and middle != 0.0
-    ]
+    off = [abs(value / middle - 1.0) for value, middle in stated if np.isfinite(middle) and middle != 0.0]
     return [
         ("result", f"{made.summary()[0].upper()}{made.summary()[1:]}"),
         ("where they differ", ", ".join(dict.fromkeys(f.number.place for f in open_points)) or "nowhere"),

@@ -159,11 +159,12 @@ def phase_folded(
     cube: FringeCube, fitted: ThicknessMap, model: FringeModel
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Mean amplitude of data and model in bins of fringe phase; shapes ``(B,)``, ``(W, B)``, ``(W, B)``."""
+    phase = (np.arange(PHASE_BINS) + 0.5) / PHASE_BINS
     good = (fitted.mask == 0) & (cube.mask == 0).all(axis=0)
     thickness = np.asarray(fitted.value, dtype=float)[good]
     if thickness.size == 0:
         empty = np.full((len(cube.wavelength_nm), PHASE_BINS), np.nan)
-        return (np.arange(PHASE_BINS) + 0.5) / PHASE_BINS, empty, empty
+        return phase, empty, empty
     low = float(thickness.min())
     step = 1e-3
     count = int(np.ceil((float(thickness.max()) - low) / step)) + 2
@@ -185,4 +186,4 @@ def phase_folded(
         flat = np.asarray(cube.image[row], dtype=float)[good]
         measured[row] = np.bincount(bins, flat / flat.mean() - 1.0, PHASE_BINS) / weight
         modelled[row] = np.bincount(bins, predicted, PHASE_BINS) / weight
-    return (np.arange(PHASE_BINS) + 0.5) / PHASE_BINS, measured, modelled
+    return phase, measured, modelled
