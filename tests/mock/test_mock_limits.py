@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.errors import FringeSimError, InputError, OutOfRangeError
+from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.mock import (
     Defects,
     Film,
@@ -22,7 +23,7 @@ from lsst.fringe_sim.mock import (
     write_mock_flats,
 )
 from lsst.fringe_sim.mock.raw_frames import checked_thickness
-from lsst.fringe_sim.mock.visit_sources import Pointing, VisitConditions, expected_sources
+from lsst.fringe_sim.mock.visit_sources import Pointing, Scene, VisitConditions, VisitImage, expected_sources
 from lsst.fringe_sim.mock.visits import check_visits
 
 E2V = setup_optics("ts8_e2v")[0]
@@ -167,3 +168,47 @@ def test_a_sky_needs_a_telescope_and_flats_a_monochromator(setup: str) -> None:
         setup_optics(setup)
     with pytest.raises(InputError, match="behind a telescope"):
         check_visits("ts8_e2v", (64, 64))
+
+
+def image_of(x: np.ndarray, y: np.ndarray, electrons: float) -> VisitImage:
+    """Stars at places on a small sensor, in a night that disturbs nothing."""
+    still = {
+        name: 0.0
+        for name in ("dither_arcsec", "rotation_deg", "moon", "slope", "amplifier_rms", "read_noise_e")
+    }
+    night = VisitConditions(cosmic_rays_per_s_cm2=0.0, seeing_arcsec=(0.6, 0.6), **still)
+    sensor = Camera.from_name("lsstCam").detector(94).cut_down((8, 64))
+    places = (
+        0.2 * (x - 31.5),
+        0.2 * (y - 3.5),
+        np.full(x.size, 5.0),
+        np.zeros(x.size),
+        np.zeros(x.size, complex),
+    )
+    scene = Scene(night, 0.2, 0.1 * electrons * 100.0, *places)
+    return VisitImage.expose(scene, np.full((8, 64), 1.0, np.float32), sensor, 10.0, np.random.default_rng(3))
+
+
+def test_sources_whose_centre_lies_on_the_image_are_listed() -> None:
+    x = np.array([-0.51, -0.49, 63.49, 63.51, 20.0, 20.0, 20.0, 20.0])
+    y = np.array([4.0, 4.0, 4.0, 4.0, -0.51, -0.49, 7.49, 7.51])
+    image = image_of(x, y, 1000.0)
+    np.testing.assert_allclose(image.sources["x"], [-0.49, 63.49, 20.0, 20.0], atol=1e-9)
+    np.testing.assert_allclose(image.sources["y"], [4.0, 4.0, -0.49, 7.49], atol=1e-9)
+    np.testing.assert_allclose(image.sources["electrons"], 1000.0)
+    assert not image.sources["galaxy"].any()
+    assert not image.mask.any()
+
+
+@pytest.mark.parametrize(("electrons", "far"), [(5e4, False), (1e8, True)])
+def test_only_bright_stars_have_wings_over_the_image(electrons: float, far: bool) -> None:
+    """A star in the middle, and one beside the image, of which only its wings are on it."""
+    light = image_of(np.array([-60.0]), np.array([4.0]), electrons).electrons
+    assert (light.sum() > 2.0 * light.size) == far
+    middle = image_of(np.array([31.0]), np.array([4.0]), electrons)
+    row, column = np.unravel_index(np.argmax(middle.electrons), middle.electrons.shape)
+    if far:
+        assert middle.mask.any()
+    else:
+        assert (row, column) == (4, 31)
+        assert middle.electrons.sum() == pytest.approx(electrons, rel=0.3)

@@ -20,6 +20,8 @@ from lsst.fringe_sim.optics import (
     layer_absorption,
     reduce_to_phase,
 )
+from lsst.fringe_sim.optics.coherence import phase_states
+from lsst.fringe_sim.optics.diffuse import DiffuseReturn
 from lsst.fringe_sim.optics.illumination import GaussianProfile, TriangularProfile
 
 INF = np.inf
@@ -175,3 +177,109 @@ def test_responses_that_are_added_and_mixed() -> None:
     far = replace(other, kappa=1.3 * kappa)
     mixed = one.mixed_with(far, 0.3).evaluate(thickness)
     np.testing.assert_allclose(mixed, 0.7 * first + 0.3 * far.evaluate(thickness), rtol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(1.0, [INF, INF]), ([1.0, 1.5], INF), ([1.0, 1.5, 2.0], [INF, INF])])
+def test_as_many_layers_as_thicknesses(shape: tuple[Any, Any]) -> None:
+    with pytest.raises(InputError, match="the same number of layers"):
+        layer_absorption(*shape, 0.5)
+
+
+def test_the_ends_of_a_line_count_half() -> None:
+    """As in any sum by trapezoids; the line is cut off at five standard deviations on either side."""
+    offset, weight = GaussianProfile(2.0).nodes(0.1)
+    sigma = 2.0 / np.sqrt(8.0 * np.log(2.0))
+    np.testing.assert_allclose(offset[[0, -1]], [-5.0 * sigma, 5.0 * sigma])
+    assert np.diff(offset).max() <= 0.1
+    shape = np.exp(-0.5 * (offset / sigma) ** 2)
+    shape[[0, -1]] *= 0.5
+    np.testing.assert_allclose(weight, shape / shape.sum(), rtol=1e-12)
+    assert GaussianProfile(0.01).nodes(0.1)[0].size == 17
+    for width, nodes in ((0.3, 16), (0.85, 18)):
+        assert TriangularProfile(width).nodes(0.1)[0].size == nodes
+
+
+def test_a_material_on_the_way_to_another_table() -> None:
+    wave = np.array([900.0, 960.0, 1000.0])
+    own, other, third = (
+        get_medium(f"Si_{name}").index(wave, 183.0) for name in ("franta2017", "green2008", "schinke2015")
+    )
+    made = get_medium("Si_franta2017").modified(toward=(("Si_green2008", 0.3), ("Si_schinke2015", -0.5)))
+    n = own.real + 0.3 * (other.real - own.real) - 0.5 * (third.real - own.real)
+    k = own.imag * (other.imag / own.imag) ** 0.3 * (third.imag / own.imag) ** -0.5
+    np.testing.assert_allclose(made.index(wave, 183.0), n + 1j * k, rtol=1e-12)
+
+
+@pytest.mark.parametrize("spread_um", [0.0, 0.01])
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+@pytest.mark.parametrize("step_um", [0.02, -0.02, 0.0])
+def test_a_grid_may_run_either_way(step_um: float, loss: float, spread_um: float) -> None:
+    """Over so many micrometres that in a layer which absorbs it is summed in pieces."""
+    rng, shape = np.random.default_rng(3), (1, 1, 5)
+    a, b, e, x, y = rng.normal(size=(5, *shape))
+    kappa = rng.uniform(15.0, 25.0, shape) + 1j * loss
+    g = 0.5 * np.exp(2j * np.pi * rng.random(shape))
+    made, weight = PhaseResponse(a, b, e, x + 1j * y, g, kappa, spread_um=spread_um), np.full((1, 5), 0.2)
+    grid = (20.0, step_um, 900)
+    exact = made.averaged(weight, 20.0 + step_um * np.arange(900))
+    np.testing.assert_allclose(made.averaged_on_grid(weight, *grid), exact, atol=1e-12)
+    slope = made.averaged_derivative_on_grid(weight, *grid)
+    back = made.averaged_derivative_on_grid(weight, 20.0 + 899.0 * step_um, -step_um, 900)
+    np.testing.assert_allclose(slope, back[:, ::-1], atol=1e-10)
+
+
+@pytest.mark.parametrize("nodes", [16_384, 16_387])
+def test_many_nodes_of_one_exposure_are_summed_in_shares(nodes: int) -> None:
+    """Whether the shares are equal or not."""
+    rng = np.random.default_rng(37)
+    a, b, e, x, y = rng.normal(size=(5, 1, 1, nodes))
+    kappa = rng.uniform(15.0, 25.0, (1, 1, nodes)) + 0j
+    made = PhaseResponse(a, b, e, x + 1j * y, 0.2 * np.exp(1j * x), kappa)
+    weight = np.full((1, nodes), 1.0 / nodes)
+    exact = made.averaged(weight, 10.0 + 0.01 * np.arange(0, 300, 60))
+    np.testing.assert_allclose(made.averaged_on_grid(weight, 10.0, 0.01, 300)[:, ::60], exact, atol=1e-12)
+
+
+def test_a_thick_layer_between_mirrors() -> None:
+    """Against the mean over many of its phases; of mirrors without loss no sum over phases is long enough."""
+    index = np.array([1.0, 0.05 + 6.0j, 1.5, 0.05 + 6.0j, 3.6 + 0.01j, 1.0])
+    thickness = np.array([0.0, 0.005, 30.0, 0.005, 2.0, 0.0])
+    spread = np.array([0.0, 0.0, INF, 0.0, 0.0, 0.0])
+    ours = reduce_to_phase(index, thickness, 0.9, 0.2, "s", varying=4, layers=[4], spread=spread).evaluate(
+        2.0
+    )
+    places = 30.0 + 0.45 / np.sqrt(1.5**2 - np.sin(0.2) ** 2) * np.arange(1024) / 1024
+    depth = np.repeat(np.where(thickness == 0.0, INF, thickness)[:, np.newaxis], 1024, axis=1)
+    depth[2] = places
+    expected = layer_absorption(index, depth, 0.9, 0.2, "s")[4].mean()
+    assert ours == pytest.approx(expected, rel=1e-6)
+    lossless = np.array([1.0, 1e-9 + 6.0j, 1.5, 1e-9 + 6.0j, 3.6, 1.0])
+    states = phase_states(lossless[:, np.newaxis], thickness, np.array([0.9]), np.zeros(1), "s", [2], spread)
+    assert sum(state.share for state in states) == pytest.approx(1.0)
+    assert len(states) == 512
+
+
+@pytest.mark.parametrize("below", [1.5, 4.5])
+def test_scattered_light_above_anything(below: float) -> None:
+    """Of less index than silicon, or of more: what is absorbed and what leaves are parts, and not all of it."""
+    silicon = get_medium("Si")
+    stack = LayerStack(
+        (
+            Layer("top", constant_medium("air", 1.0), INF),
+            Layer("detection", silicon, 100.0),
+            Layer("first", silicon, 0.0),
+            Layer("second", silicon, 0.0),
+            Layer("film", constant_medium("film", below), 1.0),
+            Layer("bottom", GLASS, INF),
+        )
+    )
+    diffuse = DiffuseReturn("first", "second", 0.3, 0.4)
+    wave = np.array([900.0, 960.0, 1000.0])
+    absorbed, left = diffuse.fate(stack, "detection", wave, 183.0)
+    assert np.all((absorbed > 0.0) & (left > 0.0) & (absorbed + left < 1.0))
+    assert np.all(np.diff(absorbed) < 0.0)
+    # A thick sensor takes all that comes back once.
+    thick = stack.replace_layer("detection", thickness_um=1e6)
+    absorbed, left = diffuse.fate(thick, "detection", wave, 183.0)
+    np.testing.assert_allclose(absorbed, 1.0, atol=1e-9)
+    np.testing.assert_allclose(left, 0.0, atol=1e-9)

@@ -83,7 +83,7 @@ def series_on_grid(
     if slow == 0.0:
         return _segment(rule, (*coefficients, weight), spread_um, (start_um, step_um, count), order, 1)
     decay = -math.log(min(max(float(np.abs(coefficients[4]).max()), 0.1), MOST_RATIO))
-    pieces = max(1, math.ceil(0.5 * slow * step_um * count / (_SLOW_RANGE * decay)))
+    pieces = max(1, math.ceil(0.5 * slow * abs(step_um) * count / (_SLOW_RANGE * decay)))
     edges = np.linspace(0, count, pieces + 1).astype(int)
     grids = [(start_um + step_um * low, step_um, high - low) for low, high in itertools.pairwise(edges)]
     parts = [
