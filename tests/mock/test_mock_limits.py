@@ -22,7 +22,9 @@ from lsst.fringe_sim.mock import (
     setup_optics,
     write_mock_flats,
 )
+from lsst.fringe_sim.mock.line_shapes import LINE_SHAPES
 from lsst.fringe_sim.mock.raw_frames import checked_thickness
+from lsst.fringe_sim.mock.thickness import PixelArea
 from lsst.fringe_sim.mock.visit_sources import Pointing, Scene, VisitConditions, VisitImage, expected_sources
 from lsst.fringe_sim.mock.visits import check_visits
 
@@ -170,23 +172,22 @@ def test_a_sky_needs_a_telescope_and_flats_a_monochromator(setup: str) -> None:
         check_visits("ts8_e2v", (64, 64))
 
 
-def image_of(x: np.ndarray, y: np.ndarray, electrons: float) -> VisitImage:
-    """Stars at places on a small sensor, in a night that disturbs nothing."""
-    still = {
-        name: 0.0
-        for name in ("dither_arcsec", "rotation_deg", "moon", "slope", "amplifier_rms", "read_noise_e")
-    }
-    night = VisitConditions(cosmic_rays_per_s_cm2=0.0, seeing_arcsec=(0.6, 0.6), **still)
-    sensor = Camera.from_name("lsstCam").detector(94).cut_down((8, 64))
-    places = (
-        0.2 * (x - 31.5),
-        0.2 * (y - 3.5),
-        np.full(x.size, 5.0),
-        np.zeros(x.size),
-        np.zeros(x.size, complex),
+def scene_of(x: np.ndarray, y: np.ndarray, electrons: float, scale: float = 0.2, **night: float) -> Scene:
+    """Stars at places on a sensor of 8 x 64 pixels, in a night that disturbs nothing."""
+    still = dict.fromkeys(
+        ("dither_arcsec", "rotation_deg", "moon", "slope", "amplifier_rms", "read_noise_e"), 0.0
     )
-    scene = Scene(night, 0.2, 0.1 * electrons * 100.0, *places)
-    return VisitImage.expose(scene, np.full((8, 64), 1.0, np.float32), sensor, 10.0, np.random.default_rng(3))
+    conditions = VisitConditions(cosmic_rays_per_s_cm2=0.0, seeing_arcsec=(0.6, 0.6), **{**still, **night})
+    stars = np.full(x.size, 5.0), np.zeros(x.size), np.zeros(x.size, complex)
+    return Scene(conditions, scale, 10.0 * electrons, scale * (x - 31.5), scale * (y - 3.5), *stars)
+
+
+def image_of(
+    x: np.ndarray, y: np.ndarray, electrons: float, scale: float = 0.2, sky: float = 1.0
+) -> VisitImage:
+    sensor = Camera.from_name("lsstCam").detector(94).cut_down((8, 64))
+    scene, dark = scene_of(x, y, electrons, scale), np.full((8, 64), sky, np.float32)
+    return VisitImage.expose(scene, dark, sensor, 10.0, np.random.default_rng(3))
 
 
 def test_sources_whose_centre_lies_on_the_image_are_listed() -> None:
@@ -200,15 +201,83 @@ def test_sources_whose_centre_lies_on_the_image_are_listed() -> None:
     assert not image.mask.any()
 
 
-@pytest.mark.parametrize(("electrons", "far"), [(5e4, False), (1e8, True)])
-def test_only_bright_stars_have_wings_over_the_image(electrons: float, far: bool) -> None:
-    """A star in the middle, and one beside the image, of which only its wings are on it."""
-    light = image_of(np.array([-60.0]), np.array([4.0]), electrons).electrons
-    assert (light.sum() > 2.0 * light.size) == far
-    middle = image_of(np.array([31.0]), np.array([4.0]), electrons)
-    row, column = np.unravel_index(np.argmax(middle.electrons), middle.electrons.shape)
-    if far:
-        assert middle.mask.any()
-    else:
-        assert (row, column) == (4, 31)
-        assert middle.electrons.sum() == pytest.approx(electrons, rel=0.3)
+@pytest.mark.parametrize(
+    ("electrons", "scale", "away_px", "lit"),
+    [
+        (1e11, 0.2, 200.0, True),
+        (1e11, 0.2, 258.0, False),
+        (1e11, 0.4, 100.0, True),
+        (1e11, 0.4, 130.0, False),
+    ],
+)
+def test_wings_of_bright_stars_reach_over_a_hundred_arcseconds(
+    electrons: float, scale: float, away_px: float, lit: bool
+) -> None:
+    """Of a star beside the image, of which no more than its wings are on it: 51.3 arcsec to either side."""
+    image = image_of(np.array([-away_px]), np.array([4.0]), electrons, scale, sky=1e4)
+    assert (image.electrons.mean() > 1.001e4) == lit
+    assert image.sources.size == 0
+
+
+def test_a_star_has_its_electrons_at_its_place() -> None:
+    image = image_of(np.array([31.0]), np.array([4.0]), 5e4)
+    row, column = np.unravel_index(np.argmax(image.electrons), image.electrons.shape)
+    assert (row, column) == (4, 31)
+    assert 0.7 * 5e4 < image.electrons.sum() < 5.2e4
+
+
+def test_pointings_stay_on_the_patch() -> None:
+    """Three times their rms from its centre, and turned by no more than asked."""
+    scene = scene_of(np.zeros(1), np.zeros(1), 1.0, dither_arcsec=2.0, rotation_deg=30.0)
+    rng = np.random.default_rng(8)
+    looks = [scene.pointing(rng) for _ in range(4000)]
+    for offsets in ([one.east_arcsec for one in looks], [one.north_arcsec for one in looks]):
+        assert (min(offsets), max(offsets)) == (-6.0, 6.0)
+        assert np.std(offsets) == pytest.approx(2.0, rel=0.05)
+    turns = np.degrees([one.angle_rad for one in looks])
+    assert -30.0 <= turns.min() < -29.8
+    assert 29.8 < turns.max() <= 30.0
+
+
+@pytest.mark.parametrize(("fwhm", "numbers"), [(0.1, (81, 40)), (0.6, (103, 40)), (3.0, (511, 200))])
+def test_lines_have_the_width_that_is_asked(fwhm: float, numbers: tuple[int, int]) -> None:
+    """Variance of a Gaussian and of a triangle; half of a Lorentzian lies within half its width."""
+    for name, variance, number in (
+        ("gaussian", fwhm**2 / (8.0 * math.log(2.0)), numbers[0]),
+        ("triangular", fwhm**2 / 6.0, numbers[1]),
+    ):
+        offset, weight = LINE_SHAPES[name](fwhm, 0.03)
+        assert weight.sum() == pytest.approx(1.0)
+        assert weight @ offset == pytest.approx(0.0, abs=1e-12)
+        assert weight @ offset**2 == pytest.approx(variance, rel=1e-6)
+        assert offset.size == number
+    offset, weight = LINE_SHAPES["lorentzian"](fwhm, 0.3 * fwhm)
+    assert np.abs(offset).max() == pytest.approx(10.0 * fwhm, rel=1e-2)
+    assert weight[np.abs(offset) < 0.5 * fwhm].sum() == pytest.approx(
+        math.atan(1.0) / math.atan(20.0), abs=0.02
+    )
+
+
+def test_maps_of_few_pixels() -> None:
+    assert random_field((1, 1), RNG, mean=5.0, span=2.0).tolist() == [[5.0]]
+    area = PixelArea.of(np.array([[1.0, 2.0, 4.0]]))
+    assert not area.slope_y.any()
+    np.testing.assert_allclose(area.slope_x, [[1.0, 4.0 / 3.0, 2.0]])
+    two = PixelArea.of(np.array([[1.0, 2.0], [4.0, 3.0]]))
+    np.testing.assert_allclose(two.slope_y, [[3.0, 1.0], [3.0, 1.0]])
+    np.testing.assert_allclose(two.slope_x, [[1.0, 1.0], [-1.0, -1.0]])
+    assert two.range_um == (-1.0, 6.0)
+    summit = PixelArea.of(np.array([[1.0], [3.0], [2.0]]))
+    np.testing.assert_allclose(summit.slope_y, [[2.0], [0.0], [-1.0]])
+    mean = area.average(lambda t: t**3)
+    exact = [[((t + 0.5 * s) ** 4 - (t - 0.5 * s) ** 4) / (4.0 * s) for t, s in ((1, 1), (2, 4 / 3), (4, 2))]]
+    np.testing.assert_allclose(mean, exact, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("thickness", "first"), [(0.001, 0.0), (0.03, 0.018)])
+def test_tables_begin_below_the_thinnest_layer(thickness: float, first: float) -> None:
+    """By four steps, but not with less than no thickness."""
+    table = E2V.table((thickness, thickness), [960.0])
+    assert table.grid_um[0] == pytest.approx(first)
+    direct = E2V.flat_field(thickness, 960.0)
+    assert table.evaluate(0, np.array([thickness])) == pytest.approx(direct, rel=1e-5)
