@@ -129,7 +129,14 @@ def test_beam_is_a_distribution(lsst):
 def test_cone_of_rays_obeys_the_sine_condition():
     cone = ConeOptics(1.2, obscuration=0.6, rings=800, spokes=32)
     analytic = Beam.cone(1.2, 0.6, nodes=64)
-    sine = cone.trace(0.0, 0.0).sin_squared
+    rays = cone.trace(0.0, 0.0)
+    sine = rays.sin_squared
+    # The same light from all sides.
+    spread = np.mean(rays.slope_x**2)
+    assert np.mean([rays.slope_x, rays.slope_y], axis=1) == pytest.approx([0.0, 0.0], abs=1e-12)
+    assert np.mean(rays.slope_y**2) == pytest.approx(spread)
+    assert np.mean(rays.slope_x * rays.slope_y) == pytest.approx(0.0, abs=1e-12)
+    assert rays.kept_fraction == 1.0
     for power in (1, 2, 3):
         assert np.mean(sine**power) == pytest.approx(
             analytic.weight @ np.sin(analytic.theta) ** (2 * power), rel=1e-6

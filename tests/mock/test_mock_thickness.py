@@ -90,6 +90,20 @@ def test_resampled_map_spans_the_whole(whole: np.ndarray) -> None:
     np.testing.assert_allclose(small, blocks, atol=5e-3)
 
 
+@pytest.mark.parametrize("end", [0, -1])
+def test_the_measured_map_is_smooth_up_to_its_rims(end: int) -> None:
+    """The last pixels go on as those before them; of finer maps what lies beyond the last centre is as there."""
+    rows, columns = E2V_SHAPE
+    corner = (rows - 4, columns - 4) if end else (0, 0)
+    window = e2v_321((4, 4), sampling="window", corner=corner)
+    for axis in (0, 1):
+        steps = np.diff(window, axis=axis).swapaxes(0, axis)
+        np.testing.assert_allclose(steps[end], steps[1], rtol=0.05, atol=1e-6)
+    for fine in (e2v_321((2 * rows, 1))[:, 0], e2v_321((1, 2 * columns))[0]):
+        last, *before = (fine[:4] if end == 0 else fine[:-5:-1]).tolist()
+        assert last - before[0] == pytest.approx(0.5 * (before[0] - before[1]), rel=0.02, abs=1e-6)
+
+
 def test_any_map_can_be_brought_to_a_sensor(whole: np.ndarray) -> None:
     np.testing.assert_array_equal(fit_to_sensor(whole, E2V_SHAPE), whole)
     cut = fit_to_sensor(whole, (40, 50), sampling="window", corner=(7, 9))

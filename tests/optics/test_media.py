@@ -37,6 +37,16 @@ def test_outside_its_range_a_medium_refuses(name: str) -> None:
     assert medium.source
 
 
+@pytest.mark.parametrize("name", sorted(TABLES))
+def test_a_medium_is_known_from_end_to_end_of_its_table(name: str) -> None:
+    """Silicon whose temperature was measured only where it was: from 300 to 1200 nm."""
+    wavelength = np.asarray(read_table("media", TABLES[name]["table"])["wavelength"])
+    low, high = float(wavelength.min()), float(wavelength.max())
+    if TABLES[name].get("temperature") == "franta2017":
+        low, high = max(low, 300.0), min(high, 1200.0)
+    assert get_medium(name).wavelength_range_nm == (low, high)
+
+
 def test_between_nodes_the_index_neither_overshoots_nor_turns_negative() -> None:
     wavelength = np.linspace(600.0, 1100.0, 20_001)
     extinction = get_medium("Si").index(wavelength).imag

@@ -145,7 +145,7 @@ class ConeOptics:
         outer = (0.5 / self.f_number) ** 2
         sine = np.sqrt(outer * (self.obscuration**2 + (1.0 - self.obscuration**2) * share))
         tangent = sine / np.sqrt(1.0 - sine**2)
-        azimuth = 2.0 * np.pi * (np.arange(self.spokes) + 0.5) / self.spokes
+        azimuth = 2.0 * np.pi * np.arange(self.spokes) / self.spokes
         return RayBundle(
             np.outer(tangent, np.cos(azimuth)).ravel(), np.outer(tangent, np.sin(azimuth)).ravel(), 1.0
         )

@@ -54,7 +54,7 @@ def phase_states(
     axes = []
     for layer in shifted:
         below = _largest_reflection(reflect[layer:])
-        above = _largest_reflection(reflect[:layer][::-1])
+        above = _largest_reflection(reflect[:layer])
         ratio = float(np.max(below * above * np.exp(-rate[layer].imag * thickness[layer])))
         axes.append(_phases_and_shares(ratio, rate[layer].real * spread[layer]))
     states = []
@@ -65,9 +65,9 @@ def phase_states(
 
 
 def _largest_reflection(reflect: FloatArray) -> FloatArray:
-    """Upper bound of the reflection of a pile of interfaces, nearest first, whatever the phases between them."""
-    bound = reflect[-1]
-    for each in reflect[-2::-1]:
+    """Upper bound of the reflection of a pile of interfaces, in any order, whatever the phases between them."""
+    bound = reflect[0]
+    for each in reflect[1:]:
         bound = (each + bound) / (1.0 + each * bound)
     return np.minimum(bound, 1.0)
 

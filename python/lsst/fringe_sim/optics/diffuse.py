@@ -82,7 +82,9 @@ class DiffuseReturn:
         index = stack.indices(wavelength_nm, temperature_k)
         silicon, below = index[detection], stack.position(self.lower) + 1
         # Critical angles, at which the integrand has kinks: of the world outside, and of what lies below.
-        kinks = [np.sqrt(1.0 - np.minimum(index[end].real / silicon.real, 1.0) ** 2) for end in (below, 0)]
+        # What is denser than silicon has none: the interval that is left to it has no weight.
+        ratios = [np.minimum(index[end].real / silicon.real, 1.0 - 1e-9) for end in (below, 0)]
+        kinks = [np.sqrt(1.0 - ratio**2) for ratio in ratios]
         cosine, share = _rule(np.sort(np.stack(kinks), axis=0))
         absorption = 4.0 * np.pi * silicon.imag / (1e-3 * wavelength_nm)
         once = np.exp(-absorption[:, np.newaxis] * stack.layers[detection].thickness_um / cosine)

@@ -83,7 +83,7 @@ def series_on_grid(
     if slow == 0.0:
         return _segment(rule, (*coefficients, weight), spread_um, (start_um, step_um, count), order, 1)
     decay = -math.log(min(max(float(np.abs(coefficients[4]).max()), 0.1), MOST_RATIO))
-    pieces = max(1, math.ceil(0.5 * slow * step_um * count / (_SLOW_RANGE * decay)))
+    pieces = max(1, math.ceil(0.5 * slow * abs(step_um) * count / (_SLOW_RANGE * decay)))
     edges = np.linspace(0, count, pieces + 1).astype(int)
     grids = [(start_um + step_um * low, step_um, high - low) for low, high in itertools.pairwise(edges)]
     parts = [
@@ -194,7 +194,7 @@ def _harmonic(
     carry = np.exp(
         complex(-m * ki * where - 0.5 * m * m * wide, m * kr * where - m * m * kr * ki * spread * spread)
     )
-    largest, r = 0.0, math.exp(-ki * where)
+    largest = 0.0
     for k in range(_MOST_TERMS):
         bound = 0.0
         for half in range(2):
@@ -212,8 +212,8 @@ def _harmonic(
             follow *= ratio
         odd *= ratio
         largest = max(largest, bound)
-        # Terms of one harmonic fall by |h|² r² each (the first may vanish by symmetry).
-        if k >= 2 and (bound < _SMALLEST or (abs(h) * r) ** (m + 2 * k) < 1e-3 * _SMALLEST):
+        # Terms of one harmonic fall geometrically (the first may vanish by symmetry).
+        if k >= 2 and bound < _SMALLEST:
             break
     return largest
 

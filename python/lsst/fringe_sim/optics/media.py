@@ -320,7 +320,7 @@ def _read_tabulated(name: str, entry: dict[str, Any], read: Callable[[str], Tabl
         log_k = None
     else:
         floor = 1e-12  # far below any absorption that matters over a millimetre
-        log_k = PchipInterpolator(wavelength, np.log(np.maximum(k, floor)), extrapolate=False)
+        log_k = PchipInterpolator(wavelength, np.log(np.maximum(k, floor)))
     low, high = float(wavelength[0]), float(wavelength[-1])
     law: _PowerLaw | _MeasuredLaw | None = None
     match entry.get("temperature"):
@@ -360,7 +360,7 @@ def _measured_law(measured_at_k: float) -> tuple[_MeasuredLaw, NDArray[np.float6
     )
     law = _MeasuredLaw(
         CubicSpline(wavelength, n),
-        PchipInterpolator(wavelength, np.log(k), extrapolate=False),
+        PchipInterpolator(wavelength, np.log(k)),
         _power_law(read_table("media", WARM_TABLE), WARM_TABLE),
         measured_at_k,
     )

@@ -19,7 +19,7 @@ def reduce_nodes(
     layers: NDArray,
     roughness: NDArray,
     phase: NDArray,
-) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, NDArray]:
+) -> tuple[NDArray, ...]:
     """Coefficients ``a, b, e, c, g, kappa`` of every node for one polarisation.
 
     ``index`` (L, N). ``thickness`` (L,): thickness, in the unit of the wavelength; not used of the ends and of the
@@ -42,7 +42,7 @@ def reduce_nodes(
         _reduce_share(first, last, arrays, p_polarized, varying, room, real, mixed)
 
     run_shares(work, nodes, _LEAST_NODES)
-    return real[0], real[1], real[2], mixed[0], mixed[1], mixed[2]
+    return (*real, *mixed)
 
 
 _LEAST_NODES = 256  # Nodes that are worth a thread
