@@ -101,12 +101,12 @@ def global_fit(
     pixels = rescue_pixels(
         fringes, state.templates, pixels, border_slip, order, range_um=state.range_um, threads=threads
     )
-    seen = replace(calmed, sigma_um=surface.sigma_um)
+    seen = calmed._replace(sigma_um=surface.sigma_um)
     learned = learned_sigma(cells, seen, leaning, templates, state.free, state.nuisance, order)
     pixels = model_error(pixels, state.nuisance.scale_sigma, learned)
     if state.common_sigma_um > 0.0:
         whole = np.hypot(pixels.sigma, np.float32(state.common_sigma_um))
-        pixels = replace(pixels, sigma=np.asarray(whole, np.float32))
+        pixels = pixels._replace(sigma=np.asarray(whole, np.float32))
     common_slip = state.common_slip
     if state.searched and not state.free.any:
         doubt = doubt_from_shared_misfit(fringes, state.templates, pixels.value, order)

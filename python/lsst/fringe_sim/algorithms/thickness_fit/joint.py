@@ -114,18 +114,16 @@ def _fit_pixels(
     mean = _mean_response(data, tables, start, offset).astype(np.float32)
     padded = np.ones(tables.response.shape[2], np.float32)
     padded[: mean.size] = mean
-    value, spread, chi2 = start.value.copy(), start.sigma.copy(), start.chi2.copy()
+    found = PixelFit(start.value.copy(), start.sigma.copy(), start.chi2.copy(), start.n_wavelengths)
 
     def work(band: int) -> None:
         rows = slice(band * BAND_ROWS, (band + 1) * BAND_ROWS)
-        _joint_band(
-            *load_band(data, rows.start, rows.stop), tables.response, padded, tables.silicon_start_um,
-            tables.silicon_step_um, tables.start_um, tables.step_um, order_um, offset[rows], sigma[rows],
-            start.n_wavelengths[rows], value[rows], spread[rows], chi2[rows],
-        )  # fmt: skip
+        amplitude, weight = load_band(data, rows.start, rows.stop)
+        place = (offset[rows], sigma[rows])
+        _joint_band(amplitude, weight, tables, padded, order_um, *place, found.rows(rows))
 
     run_threaded(work, -(-shape[0] // BAND_ROWS), threads)
-    return PixelFit(value, spread, chi2, start.n_wavelengths)
+    return found
 
 
 def _mean_response(
@@ -146,11 +144,10 @@ def _mean_response(
 
 
 @kernel
-def _joint_band(  # type: ignore[no-untyped-def]
-    amplitude, inverse, tables, mean, silicon_start, silicon_step, start, step, order, offset, sigma,
-    used, thickness, spread, reduced,
-):  # fmt: skip
+def _joint_band(amplitude, inverse, grid, mean, order, offset, sigma, pixels):  # type: ignore[no-untyped-def]
     """Pixels of some rows; those that left out a wavelength in the first fit stay as they are."""
+    tables, silicon_start, silicon_step, start, step, _ = grid
+    thickness, spread, reduced, used = pixels
     bands = amplitude.shape[0]
     rows, columns = thickness.shape
     padded = tables.shape[2]

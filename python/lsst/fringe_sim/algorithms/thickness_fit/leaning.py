@@ -7,7 +7,7 @@ distribution that is free on a grid: Laird 1978, J. Am. Stat. Assoc. 73, 805).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,7 @@ _WEIGHTS = np.geomspace(0.5, 512.0, 11).astype(np.float32)
 """Cells around one that all cells together may count for."""
 
 
-@dataclass(frozen=True, eq=False)
-class Leanings:
+class Leanings(NamedTuple):
     """What the pixels of each cell show about the surface."""
 
     # number, score, information, squares: pixels; sums of their scores and of their information on the surface, and
@@ -145,10 +144,9 @@ def _likelihood(
 
 
 @kernel(relaxed=True)
-def lean_strip(  # type: ignore[no-untyped-def]
-    amplitude, weight, table, start, step, holds, terms, cell_of, away_y, away_x, begin, number, total, known, squares
-):  # fmt: skip
+def lean_strip(amplitude, weight, grid, holds, terms, cell_of, away_y, away_x, begin, sums):  # type: ignore[no-untyped-def]
     """One row of cells: the surface at each pixel [µm], and the sums of `Leanings`."""
+    (table, start, step), (number, total, known, squares) = grid, sums
     bands, top = amplitude.shape[0], table.shape[0] - 1.0
     value, inverse = np.zeros((1, table.shape[1]), np.float32), np.zeros((1, table.shape[1]), np.float32)
     for r in range(begin.shape[0]):

@@ -121,15 +121,15 @@ class _Problem:
         """Refined thickness, model amplitude, its slope, and what is left of the cells."""
         wavelengths = self.base.n_wavelengths
         fitted = replace(self.templates(fit), mean_response=fit.mean_response)
-        table = fitted.table()
+        grid = fitted.grid()
         value = self.cells.value.copy()
         if fit.coefficients.size:
             light = np.exp(self.cells.pattern @ fit.coefficients.T)
             value[:, :wavelengths] = (1.0 + value[:, :wavelengths]) / light - 1.0
         found = np.full_like(thickness, np.nan)
-        refine_row(value, self.cells.weight, table, fitted.start_um, fitted.step_um, thickness, found)
+        refine_row(value, self.cells.weight, *grid, thickness, found)
         found = np.where(np.isfinite(found), found, thickness)
-        model, slope = _curve(fitted, table, found)
+        model, slope = _curve(fitted, grid.table, found)
         return found, model, slope, value[:, :wavelengths] - model
 
     def step(

@@ -93,15 +93,13 @@ def chi2_about(value, weight, table, place, away, chi2):  # type: ignore[no-unty
 
 
 @kernel(relaxed=True)
-def settle_band(  # type: ignore[no-untyped-def]
-    amplitude, weight, table, start, step, asked, surface, width, away, share, apart,
-    value, sigma, chi2_out, used,
-):  # fmt: skip
+def settle_band(amplitude, weight, grid, asked, surface, width, away, share, apart, pixels):  # type: ignore[no-untyped-def]
     """Mean and rms of the posterior of the pixels that are ``asked``, in place.
 
     Pixels have a prior of a finite ``width`` about the surface, or lie anywhere within half an order of their own
     value. ``away`` are the nodes in steps of the table, ``share`` what each stands for.
     """
+    (table, start, step), (value, sigma, chi2_out, used) = grid, pixels
     bands, nodes = amplitude.shape[0], away.shape[0]
     y, w = np.zeros((1, table.shape[1]), np.float32), np.zeros((1, table.shape[1]), np.float32)
     chi2, follow = np.empty(nodes, np.float64), np.empty(nodes, np.float64)

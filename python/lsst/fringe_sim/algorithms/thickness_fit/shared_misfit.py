@@ -63,7 +63,7 @@ def doubt_from_shared_misfit(
         inside = (start > templates.start_um) & (start < templates.stop_um)
         if inside.any():
             found = np.full_like(start, np.nan)
-            refine_row(value, weight, templates.table(), templates.start_um, templates.step_um, start, found)
+            refine_row(value, weight, *templates.grid(), start, found)
             excess = (_pull(templates, value, weight, found) ** 2).sum(axis=1) - chi2
             odds += float(np.exp(-0.5 * max(float(excess[inside].mean()), 0.0) / shared))
     return odds / (1.0 + odds)
@@ -86,7 +86,7 @@ def leaves_only_noise(data: Amplitudes, templates: FringeTemplates, surface: Cel
         y, x = (index.ravel() for index in np.meshgrid(rows, columns + shift, indexing="ij"))
         value, weight = gather_pixels(data, y, x)
         found = np.full_like(start, np.nan)
-        refine_row(value, weight, templates.table(), templates.start_um, templates.step_um, start, found)
+        refine_row(value, weight, *templates.grid(), start, found)
         pulls.append(_pull(templates, value, weight, np.nan_to_num(found, nan=templates.start_um)))
         pulls[-1][~np.isfinite(found)] = np.nan
     return _is_noise((pulls[0] * pulls[1]).sum(axis=1))

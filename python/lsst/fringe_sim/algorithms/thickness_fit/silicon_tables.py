@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,7 @@ NODES_PER_ORDER = 100
 """Thicknesses in one order of the adhesive; linear interpolation is good to 5e-4 of its fringes."""
 
 
-@dataclass(frozen=True, eq=False)
-class SiliconTables:
+class SiliconTables(NamedTuple):
     """Response against the adhesive for several thicknesses of the silicon."""
 
     # response; 0 in the padding, float32, ``(n_silicon, n_thickness, padded wavelengths)``

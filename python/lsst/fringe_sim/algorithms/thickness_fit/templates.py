@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,15 @@ from ...array_types import FloatArray
 from ...errors import InputError, OutOfRangeError
 
 LANES = 8  # Wavelength axes are padded to a multiple of this, so that inner loops fill the vector registers
+
+
+class Grid(NamedTuple):
+    """Templates as compiled loops take them."""
+
+    table: NDArray[np.float32]  # `FringeTemplates.table`
+    # start, step: first thickness and spacing [µm]
+    start: float
+    step: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +130,10 @@ class FringeTemplates:
     def table(self) -> NDArray[np.float32]:
         """`amplitude` as float32 with the wavelength axis padded by zeros to a multiple of `LANES`."""
         return pad_wavelengths(self.amplitude())
+
+    def grid(self) -> Grid:
+        """`table` and the thicknesses of its rows."""
+        return Grid(self.table(), self.start_um, self.step_um)
 
     def amplitude_at(self, thickness_um: ArrayLike) -> FloatArray:
         """Amplitude at any thickness inside the grid, shape ``(n_wavelengths, *thickness.shape)``."""

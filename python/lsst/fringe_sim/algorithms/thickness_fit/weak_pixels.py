@@ -76,7 +76,7 @@ def _leanings(
 ) -> tuple[NDArray[np.float32], Leanings]:
     """The surface at each pixel [µm], and what the pixels of each cell show about it."""
     begin, sums = np.zeros(data.shape[1:], np.float32), np.zeros((4, *cells.shape))
-    table, start, step = templates.table(), templates.start_um, templates.step_um
+    grid = templates.grid()
     away_x = np.arange(data.shape[2]) - cells.x_centre[cell_of_column]
 
     def work(strip: int) -> None:
@@ -84,8 +84,8 @@ def _leanings(
             low, high = int(cells.y_edges[strip]), int(cells.y_edges[strip + 1])
             amplitude, weight = load_band(data, low, high)
             lean_strip(
-                amplitude, weight, table, start, step, local.holds[strip], local.terms[strip], cell_of_column,
-                np.arange(low, high) - cells.y_centre[strip], away_x, begin[low:high], *sums[:, strip],
+                amplitude, weight, grid, local.holds[strip], local.terms[strip], cell_of_column,
+                np.arange(low, high) - cells.y_centre[strip], away_x, begin[low:high], Leanings(*sums[:, strip]),
             )  # fmt: skip
 
     run_threaded(work, cells.shape[0], threads)
@@ -104,16 +104,15 @@ def _settle_asked(
     threads: int,
 ) -> None:
     """Posterior of some pixels, in place."""
-    table, start, step = templates.table(), templates.start_um, templates.step_um
-    away = nodes_about(order_um / step)
+    grid, away = templates.grid(), nodes_about(order_um / templates.step_um)
 
     def work(band: int) -> None:
         part = slice(band * BAND_ROWS, min((band + 1) * BAND_ROWS, len(asked)))
         if asked[part].any():
             amplitude, weight = load_band(data, part.start, part.stop)
             settle_band(
-                amplitude, weight, table, start, step, asked[part], surface[part], width[part], away, SHARE, apart,
-                pixels.value[part], pixels.sigma[part], pixels.chi2[part], pixels.n_wavelengths[part],
+                amplitude, weight, grid, asked[part], surface[part], width[part], away, SHARE, apart,
+                pixels.rows(part),
             )  # fmt: skip
 
     run_threaded(work, -(-len(asked) // BAND_ROWS), threads)
