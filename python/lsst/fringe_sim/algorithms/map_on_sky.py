@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from ..array_types import FloatArray
+from ..blocks import block_sums
 from ..errors import InputError, named_units
 from ..notebook import do_nothing
 from ..products import ObservedFrame, ThicknessMap, mask_bits
@@ -68,10 +69,10 @@ def map_on_sky(
         value, weight = fringes_alone(frame(), patterns, chosen, known.shape)
         weight[~good] = 0.0
         values.append(_cell_means(value, weight, cell))
-        weights.append(_cell_sums(weight, cell))
+        weights.append(block_sums(weight, cell))
         advance()
     seen = good.astype(float)
-    layer = np.where(_cell_sums(seen, cell) > 0.0, _cell_means(known, seen, cell), np.nan)
+    layer = np.where(block_sums(seen, cell) > 0.0, _cell_means(known, seen, cell), np.nan)
     tables = [
         response.sky({name: float(name == band) for name in response.component}) for band in response.bands
     ]
@@ -124,16 +125,9 @@ def fringes_alone(
     return value, np.where(used, weight * surface**2, 0.0)
 
 
-def _cell_sums(image: FloatArray, cell: int) -> FloatArray:
-    """Sums over cells; rows and columns that do not fill one are left out."""
-    rows, columns = (side // cell for side in image.shape)
-    cut = image[: rows * cell, : columns * cell]
-    return np.asarray(cut.reshape(rows, cell, columns, cell).sum(axis=(1, 3)))
-
-
 def _cell_means(image: FloatArray, weight: FloatArray, cell: int) -> FloatArray:
-    total = _cell_sums(weight, cell)
-    share = _cell_sums(np.where(weight > 0.0, image, 0.0) * weight, cell)
+    total = block_sums(weight, cell)
+    share = block_sums(np.where(weight > 0.0, image, 0.0) * weight, cell)
     return np.divide(share, total, out=np.zeros(total.shape), where=total > 0.0)
 
 

@@ -16,8 +16,9 @@ from matplotlib.ticker import MaxNLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from ..algorithms.flat_prep_options import GAUSSIAN_MAD
+from ..blocks import means_of_known
 from ..products import FringeComponents, FringeFrame, SkyFringe, ThicknessMap
-from ..style import LINES, TITLE_PLACE, block_mean, draw_image, figure, finite_range, panels, show_image
+from ..style import LINES, TITLE_PLACE, draw_image, figure, finite_range, panels, show_image
 
 if TYPE_CHECKING:
     from ..algorithms.coadds import Coadds
@@ -130,7 +131,7 @@ def residuals_figure(
     standard deviation of a pixel, as a fraction; of cells beside each other if not given.
     """
     block = max(1, min(residual.shape[1:]) // RESIDUAL_CELLS)
-    coarse = np.stack([block_mean(np.asarray(plane, dtype=float), block) for plane in residual])
+    coarse = np.stack([means_of_known(np.asarray(plane, dtype=float), block) for plane in residual])
     sigma = pixel_noise(coarse) if noise is None else np.asarray(noise) / block
     size = f"means over {block} × {block} px" if block > 1 else "pixels"
     return _gallery_figure(
