@@ -22,7 +22,7 @@ from .smooth_field import Splines
 from .thickness_fit import fit_thickness
 from .thickness_fit.amplitudes import Amplitudes
 from .thickness_fit.global_fit import global_fit
-from .thickness_fit.templates import FringeTemplates
+from .thickness_fit.templates import FlatTemplates
 from .thickness_fit.uncertainty import slip_probability
 
 _WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
@@ -52,7 +52,7 @@ def _fit_cells_and_pixels() -> None:
     """The fit on templates that need no optics."""
     grid = np.arange(_RANGE_UM[0] - _ORDER_UM, _RANGE_UM[1] + _ORDER_UM, _ORDER_UM / 300)
     turns = 4.0 * np.pi * 1.55e3 / _WAVELENGTHS
-    templates = FringeTemplates(
+    templates = FlatTemplates(
         1.0 + 0.1 * np.cos(grid[:, None] * turns), float(grid[0]), _ORDER_UM / 300, _WAVELENGTHS
     )
     image = 0.1 * np.cos(_relief(128)[None] * turns[:, None, None])

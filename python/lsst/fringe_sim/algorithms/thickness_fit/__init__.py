@@ -11,13 +11,13 @@ from .pixels import PixelFit
 from .silicon import find_silicon
 from .silicon_result import SiliconFit, SiliconForecast, SiliconSearch, silicon_map
 from .silicon_tables import SiliconModel
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 __all__ = [
     "FIT_METHODS",
     "SILICON_FIELDS",
     "Amplitudes",
-    "FringeTemplates",
+    "FlatTemplates",
     "GlobalFit",
     "NuisanceFit",
     "Nuisances",

@@ -17,7 +17,7 @@ from .between_orders import break_price
 from .misfit import Misfit, improbability
 from .newton import gauss_newton
 from .pixels import SAME_SURFACE, PixelFit
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _SHARE_OF_PRICE = 0.25  # A break between two neighbouring pixels costs so much of one between two cells
 _SWEEPS = 6
@@ -27,7 +27,7 @@ _MOST_JUDGED = 20_000  # Pixels that show how far all are off
 
 def settle_borders(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     pixels: PixelFit,
     rough: NDArray[np.bool_],
     order_um: float,

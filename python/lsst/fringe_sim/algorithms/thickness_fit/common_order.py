@@ -9,7 +9,7 @@ import numpy as np
 from .learning import learn
 from .learning_cells import LearningCells
 from .nuisances import NuisanceFit, Nuisances
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _MOST_ORDERS = 8
 _CLEAR = 100.0  # Chi-square difference beyond which the orders behind one need not be asked
@@ -29,7 +29,7 @@ class CommonOrder:
 
 def rank_orders(
     cells: LearningCells,
-    base: FringeTemplates,
+    base: FlatTemplates,
     free: Nuisances,
     start: NuisanceFit,
     order_um: float,
@@ -79,7 +79,7 @@ def rank_orders(
 
 
 def _guess_at_order(
-    cells: LearningCells, base: FringeTemplates, free: Nuisances, start: NuisanceFit, move_um: float
+    cells: LearningCells, base: FlatTemplates, free: Nuisances, start: NuisanceFit, move_um: float
 ) -> tuple[LearningCells, NuisanceFit]:
     """Cells moved by some orders, and the wavelengths at which their fringes look the same there."""
     moved = replace(cells, thickness_um=cells.thickness_um + np.float32(move_um))

@@ -14,7 +14,7 @@ from ...products import FlatFit
 from .cells import Cells
 from .nuisances import NuisanceFit
 from .pixels import PixelFit
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 from .wavelengths import spread_of_wavelengths
 
 CERTAIN = 25.0
@@ -75,7 +75,7 @@ def _block_medians(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], ND
 
 
 def contrast_map(
-    cells: Cells, templates: FringeTemplates, thickness_um: NDArray[np.float32]
+    cells: Cells, templates: FlatTemplates, thickness_um: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Contrast in blocks of cells over that of the templates, the thickness of each cell being free.
 

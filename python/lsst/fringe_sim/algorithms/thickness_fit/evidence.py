@@ -16,7 +16,7 @@ from scipy.ndimage import uniform_filter
 from ...compiled import kernel, run_threaded, subkernel
 from .cells import Cells
 from .newton import gauss_newton
-from .templates import FringeTemplates, arc_length_nodes
+from .templates import FlatTemplates, arc_length_nodes
 
 NODES_PER_ORDER = 16
 """Templates in one fringe order: the least chi-square from a parabola is then good to 2e-4 of its swing."""
@@ -64,7 +64,7 @@ class _Nodes(NamedTuple):
 
 def order_evidence(
     cells: Cells,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     order_um: float,
     *,
     range_um: tuple[float, float],
@@ -327,7 +327,7 @@ def _smooth(slope: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def refine_cells(
-    cells: Cells, templates: FringeTemplates, thickness_um: NDArray[np.float32], threads: int = 2
+    cells: Cells, templates: FlatTemplates, thickness_um: NDArray[np.float32], threads: int = 2
 ) -> NDArray[np.float32]:
     """Least chi-square of every cell near a given thickness; NaN stays NaN.
 

@@ -29,7 +29,7 @@ from .pixels import PixelFit
 from .rescue import chi2_limits, typical_misfit
 from .silicon_result import SiliconSearch
 from .silicon_tables import SiliconModel
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 from .uncertainty import lone_slip_probability, slip_probability
 
 STEPS_PER_ORDER = 300
@@ -204,7 +204,7 @@ def make_templates(
     wavelength_nm: NDArray[np.float64],
     range_um: tuple[float, float],
     observable: str | None = None,
-) -> FringeTemplates:
+) -> FlatTemplates:
     """Templates of a model over a range of thickness, with a margin of one order on both sides.
 
     Parameters
@@ -243,7 +243,7 @@ def make_templates(
     ]
     group = 1.0 - wavelength_nm * (near.real - index.real) / index.real
     beside = _turn_beside(model, wavelength_nm, response, group, (start, step))
-    return FringeTemplates(response, start, step, wavelength_nm, group=group, beside_um=beside)
+    return FlatTemplates(response, start, step, wavelength_nm, group=group, beside_um=beside)
 
 
 def _turn_beside(
@@ -253,7 +253,7 @@ def _turn_beside(
     group: NDArray[np.float64],
     grid_um: tuple[float, float],
 ) -> NDArray[np.float64]:
-    """What the thin layers beside the varying one add to how its fringe turns, as `FringeTemplates` takes it.
+    """What the thin layers beside the varying one add to how its fringe turns, as `FlatTemplates` takes it.
 
     The derivative of the response in wavelength is that in thickness times a straight line in thickness, whose slope
     is the group index, and a change of level and swing.
@@ -288,11 +288,11 @@ def with_observable(model: FringeModel, observable: str) -> FringeModel:
 
 def _repeated_walk(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     start: tuple[int, int],
     range_um: tuple[float, float],
     threads: int,
-) -> tuple[PixelFit, FringeTemplates]:
+) -> tuple[PixelFit, FlatTemplates]:
     """Walk twice: the mean response over the sensor is known after the first time."""
     first = walk_fit(data, templates, start_pixel=start, range_um=range_um, threads=threads)
     sample = sample_pixels(data)

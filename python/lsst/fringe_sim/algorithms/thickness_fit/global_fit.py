@@ -21,7 +21,7 @@ from .relaxation import SettledCells, settle_orders
 from .rescue import rescue_pixels
 from .shared_misfit import doubt_from_shared_misfit
 from .solver import Solver, surface_of
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 from .weak_pixels import settle_weak_pixels
 
 
@@ -35,7 +35,7 @@ class GlobalFit:
     # probability that a pixel near a step lies on the other side of it, or that one which was fitted by itself has
     # another order, float32, ``(ny, nx)``
     border_slip: NDArray[np.float32]
-    templates: FringeTemplates  # the model as it was normalised in the end
+    templates: FlatTemplates  # the model as it was normalised in the end
     nuisance: NuisanceFit  # patterns and contrast beside the fringes
     order_um: float  # thickness of one fringe order [µm]
     # ``sensor``, ``narrow`` or ``range``: over which thicknesses the mean response was taken. ``narrow`` is a
@@ -50,7 +50,7 @@ class GlobalFit:
 
 def global_fit(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     *,
     range_um: tuple[float, float],
     cell_px: int | None = None,

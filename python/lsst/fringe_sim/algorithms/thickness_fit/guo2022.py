@@ -15,12 +15,12 @@ from ...compiled import kernel, run_threaded, subkernel
 from ...errors import InputError, OutOfRangeError
 from .amplitudes import Amplitudes
 from .pixels import PixelFit
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 
 def walk_fit(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     *,
     start_pixel: tuple[int, int],
     range_um: tuple[float, float],

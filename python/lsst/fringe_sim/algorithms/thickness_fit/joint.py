@@ -19,7 +19,7 @@ from .rescue import typical_misfit
 from .silicon import STEPS_PER_SILICON_ORDER, find_silicon
 from .silicon_result import SiliconFit, SiliconForecast, SiliconSearch
 from .silicon_tables import SiliconModel, SiliconTables, silicon_free
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 from .uncertainty import slip_probability
 
 _STEPS = 3
@@ -41,7 +41,7 @@ class JointFit:
 
 def joint_fit(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     model: SiliconModel,
     search: SiliconSearch,
     *,

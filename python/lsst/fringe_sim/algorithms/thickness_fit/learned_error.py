@@ -16,7 +16,7 @@ from .learning_cells import LearningCells
 from .local_surface import shares_of_middle
 from .nuisances import NuisanceFit, Nuisances, patterns_of_cells
 from .pixels import CellSurface
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _MOST_PLACES = 32  # Places along a side of the sensor at which the surface is asked
 _AT_ONCE = 256
@@ -26,7 +26,7 @@ def learned_sigma(
     cells: Cells,
     surface: CellSurface,
     leaning: BoolArray,
-    base: FringeTemplates,
+    base: FlatTemplates,
     free: Nuisances,
     fit: NuisanceFit,
     order_um: float,
@@ -66,7 +66,7 @@ def _variances(
     surface: CellSurface,
     y: NDArray[np.intp],
     x: NDArray[np.intp],
-    base: FringeTemplates,
+    base: FlatTemplates,
     free: Nuisances,
     fit: NuisanceFit,
     order_um: float,

@@ -24,7 +24,7 @@ from .leaning import most_likely_shares, responsibility
 from .newton import score
 from .pixels import LONE_CELL_PENALTY, SAME_SURFACE, CellSurface
 from .posterior import REACH
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _SIDE = np.arange(-2, 3)  # Cells about one that show its surface
 _FAR = 2  # Cells that are so many away have others between them and the one in the middle
@@ -59,7 +59,7 @@ class LocalSurface:
 def local_surface(
     surface: CellSurface,
     cells: Cells,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     asked: BoolArray,
     order_um: float,
 ) -> LocalSurface:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .cells import Cells
 from .evidence import IMPOSSIBLE, OrderEvidence, order_evidence, refine_cells
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class LoneSurfaces:
 
 def settle_lone_surfaces(
     cells: Cells,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     thickness_um: NDArray[np.float32],
     segment: NDArray[np.int32],
     independence: NDArray[np.float64],

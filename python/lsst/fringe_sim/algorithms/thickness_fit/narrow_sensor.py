@@ -26,7 +26,7 @@ from ...array_types import FloatArray
 from ...compiled import kernel, run_threaded, subkernel
 from .cells import Cells
 from .evidence import refine_row
-from .templates import FringeTemplates, pad_wavelengths
+from .templates import FlatTemplates, pad_wavelengths
 
 _MOST_CELLS = 600  # Cells that are asked; more would only add certainty
 _FEW_CELLS = 120  # Cells with which all starts are compared; only the best of these go on with more
@@ -52,7 +52,7 @@ _OWN_MEAN = 0.1
 class NarrowSensor:
     """What a sensor of few orders says about its common thickness."""
 
-    templates: FringeTemplates  # the model with the mean response of the best solution
+    templates: FlatTemplates  # the model with the mean response of the best solution
     range_um: tuple[float, float]  # least and largest thickness of the solution [µm]
     slip: float  # probability that another solution is true
     sigma_um: float  # uncertainty of the mean thickness of the sensor [µm]
@@ -66,7 +66,7 @@ class NarrowSensor:
         return bool(np.mean(miss < _SAME_SOLUTION * order_um) > 1.0 - _FEW_ASTRAY)
 
 
-def is_own_mean(cells: Cells, templates: FringeTemplates) -> bool:
+def is_own_mean(cells: Cells, templates: FlatTemplates) -> bool:
     """Whether the flats are over their mean over these very cells, not over a larger sensor they were cut from."""
     wavelengths = templates.n_wavelengths
     weight = cells.weight[..., :wavelengths] > 0.0
@@ -78,7 +78,7 @@ def is_own_mean(cells: Cells, templates: FringeTemplates) -> bool:
 
 def settle_narrow_sensor(
     cells: Cells,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     ideas_um: Sequence[NDArray[np.float32]],
     order_um: float,
     *,
@@ -199,7 +199,7 @@ class _Sample:
         )
 
     def follow(
-        self, templates: FringeTemplates, starts_um: FloatArray, rounds: int, threads: int
+        self, templates: FlatTemplates, starts_um: FloatArray, rounds: int, threads: int
     ) -> list[_Solution]:
         """Refit and renormalise in turn, from each of some starts of shape ``(starts, n)``.
 
@@ -221,7 +221,7 @@ class _Sample:
         wavelengths = templates.n_wavelengths
         return [_Solution(t, m[:wavelengths], float(c)) for t, m, c in zip(out, mean, chi2, strict=True)]
 
-    def better_sides(self, solution: _Solution, templates: FringeTemplates, order_um: float) -> FloatArray:
+    def better_sides(self, solution: _Solution, templates: FlatTemplates, order_um: float) -> FloatArray:
         """Thickness of every cell at the least chi-square within half an order, the mean response being as it is."""
         table = pad_wavelengths(templates.response)
         origin, step = templates.start_um, templates.step_um
@@ -335,7 +335,7 @@ class _Together:
     chi2: float
 
     @classmethod
-    def of(cls, sample: _Sample, thickness_um: FloatArray, templates: FringeTemplates) -> _Together:
+    def of(cls, sample: _Sample, thickness_um: FloatArray, templates: FlatTemplates) -> _Together:
         """At a thickness of every cell; the mean is that of these thicknesses."""
         wavelengths, count, step = templates.n_wavelengths, len(sample.weight), templates.step_um
         place = (thickness_um - templates.start_um) / step
@@ -369,7 +369,7 @@ class _Together:
         return np.asarray(inverse * right - scaled @ answer)
 
 
-def _settle_together(sample: _Sample, solution: _Solution, templates: FringeTemplates) -> _Solution:
+def _settle_together(sample: _Sample, solution: _Solution, templates: FlatTemplates) -> _Solution:
     """Levenberg-Marquardt steps of all cells at once: refitting and renormalising in turn crawls."""
     thickness, damping = solution.thickness_um.astype(float), 1e-6
     state = _Together.of(sample, thickness, templates)
@@ -389,7 +389,7 @@ def _settle_together(sample: _Sample, solution: _Solution, templates: FringeTemp
 
 
 def _settle_sides(
-    sample: _Sample, solution: _Solution, templates: FringeTemplates, order_um: float
+    sample: _Sample, solution: _Solution, templates: FlatTemplates, order_um: float
 ) -> _Solution:
     """Settle a solution again with the cells that had taken the wrong side of a crest on the other one.
 
@@ -407,7 +407,7 @@ def _settle_sides(
     return settled
 
 
-def _common_sigma(sample: _Sample, solution: _Solution, templates: FringeTemplates) -> float:
+def _common_sigma(sample: _Sample, solution: _Solution, templates: FlatTemplates) -> float:
     """Standard uncertainty of the mean thickness of the sampled cells, as if they were the whole sensor [µm]."""
     together = _Together.of(sample, solution.thickness_um, templates)
     everywhere = np.ones(len(solution.thickness_um))

@@ -18,7 +18,7 @@ from .amplitudes import Amplitudes
 from .bands import BAND_ROWS, load_band
 from .medians import middle_of
 from .newton import gauss_newton, newton_block
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _STEPS = 5  # Most Gauss-Newton steps; two are usual
 _LONGEST_STEP = 0.1  # Longest Gauss-Newton step, in fringe orders
@@ -154,7 +154,7 @@ def _calm_row(surface, row, out):  # type: ignore[no-untyped-def]
 
 def fit_pixels(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     surface: CellSurface,
     order_um: float,
     *,

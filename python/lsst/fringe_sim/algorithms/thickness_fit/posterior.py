@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...compiled import kernel
 from .newton import score
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _CHANGE = 0.25
 """Relative change of the information within three standard deviations up to which the likelihood is a parabola: its
@@ -36,7 +36,7 @@ def nodes_about(order: float) -> NDArray[np.float64]:
 
 
 def widest_parabola(
-    templates: FringeTemplates, weight: NDArray[np.floating], order_um: float
+    templates: FlatTemplates, weight: NDArray[np.floating], order_um: float
 ) -> NDArray[np.float32]:
     """Largest uncertainty at each thickness, in steps of the table, for which the likelihood is a parabola.
 

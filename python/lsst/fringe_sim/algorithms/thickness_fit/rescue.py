@@ -18,7 +18,7 @@ from .evidence import OrderEvidence, order_evidence
 from .medians import middle_of
 from .newton import gauss_newton
 from .pixels import PixelFit
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 SUSPECT_PROBABILITY = 1e-7  # A pixel whose chi-square is that improbable is not believed
 _FEWEST_TO_SPARE = 6  # A wavelength is left out only of so many or more
@@ -37,7 +37,7 @@ def chi2_limits(most: int) -> NDArray[np.float32]:
 
 def rescue_pixels(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     pixels: PixelFit,
     slip: NDArray[np.float32],
     order_um: float,
@@ -159,7 +159,7 @@ def _take_what_fits(
     found: OrderEvidence,
     weight: NDArray[np.float32],
     place: tuple[NDArray[np.intp], NDArray[np.intp]],
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     limit: NDArray[np.float32],
     pixels: PixelFit,
     slip: NDArray[np.float32],

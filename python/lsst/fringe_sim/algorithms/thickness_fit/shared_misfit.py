@@ -15,7 +15,7 @@ from .bands import gather_pixels
 from .cells import Cells
 from .evidence import refine_row
 from .pixels import CellSurface
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _MOST_PIXELS = 4000
 _MOST_PAIRS = 40_000
@@ -27,7 +27,7 @@ _APART = 4.0
 
 
 def doubt_from_shared_misfit(
-    data: Amplitudes, templates: FringeTemplates, thickness_um: NDArray[np.float32], order_um: float
+    data: Amplitudes, templates: FlatTemplates, thickness_um: NDArray[np.float32], order_um: float
 ) -> float:
     """Probability that a solution is wrong, if all of its shared misfit has one cause.
 
@@ -69,7 +69,7 @@ def doubt_from_shared_misfit(
     return odds / (1.0 + odds)
 
 
-def leaves_only_noise(data: Amplitudes, templates: FringeTemplates, surface: CellSurface) -> bool:
+def leaves_only_noise(data: Amplitudes, templates: FlatTemplates, surface: CellSurface) -> bool:
     """Whether what a model leaves over in neighbouring pixels has nothing in common.
 
     The median over pairs of pixels is not moved by some that have a wrong order.
@@ -92,9 +92,7 @@ def leaves_only_noise(data: Amplitudes, templates: FringeTemplates, surface: Cel
     return _is_noise((pulls[0] * pulls[1]).sum(axis=1))
 
 
-def cells_leave_only_noise(
-    cells: Cells, templates: FringeTemplates, thickness_um: NDArray[np.float32]
-) -> bool:
+def cells_leave_only_noise(cells: Cells, templates: FlatTemplates, thickness_um: NDArray[np.float32]) -> bool:
     """Whether what a model leaves over in neighbouring cells has nothing in common.
 
     A cell has less noise than its pixels: fringes so weak that no pixel shows them are seen in cells. Taken for the
@@ -118,7 +116,7 @@ def _is_noise(product: NDArray[np.float64]) -> bool:
 
 
 def _pull(
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     value: NDArray[np.float32],
     weight: NDArray[np.float32],
     thickness_um: NDArray[np.float32],

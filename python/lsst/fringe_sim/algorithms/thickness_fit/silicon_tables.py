@@ -12,7 +12,7 @@ from ...array_types import FloatArray
 from ...errors import InputError
 from ...model import FringeModel
 from .amplitudes import Amplitudes
-from .templates import FringeTemplates, pad_wavelengths
+from .templates import FlatTemplates, pad_wavelengths
 
 OFFSET = "silicon_thickness.offset"
 SCAN_PER_ORDER = 12
@@ -73,7 +73,7 @@ class SiliconModel:
         if system.varying == system.detection:
             raise InputError("varying layer", system.varying, "another than the silicon, for a joint fit")
 
-    def templates(self, like: FringeTemplates, offset_um: float) -> FloatArray:
+    def templates(self, like: FlatTemplates, offset_um: float) -> FloatArray:
         """Response on the grid of templates at a thickness of the silicon, ``(n_thickness, n_wavelengths)``."""
         return self.on_grid(offset_um, like.start_um, like.step_um, len(like.response))
 
@@ -118,8 +118,8 @@ class SiliconModel:
 
 
 def silicon_free(
-    data: Amplitudes, templates: FringeTemplates, model: SiliconModel
-) -> tuple[Amplitudes, FringeTemplates]:
+    data: Amplitudes, templates: FlatTemplates, model: SiliconModel
+) -> tuple[Amplitudes, FlatTemplates]:
     """Flats and model for a first fit that does not know the silicon.
 
     The model is averaged over one order of the silicon, and what its fringes do to a flat counts as noise.

@@ -18,14 +18,14 @@ LANES = 8  # Wavelength axes are padded to a multiple of this, so that inner loo
 class Grid(NamedTuple):
     """Templates as compiled loops take them."""
 
-    table: NDArray[np.float32]  # `FringeTemplates.table`
+    table: NDArray[np.float32]  # `FlatTemplates.table`
     # start, step: first thickness and spacing [µm]
     start: float
     step: float
 
 
 @dataclass(frozen=True, eq=False)
-class FringeTemplates:
+class FlatTemplates:
     """Response of a stack against thickness, and the amplitudes a flat of that stack would show.
 
     A prepared flat is ``counts / mean - 1`` with the mean over the sensor, so the model is

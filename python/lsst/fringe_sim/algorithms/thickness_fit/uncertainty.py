@@ -10,7 +10,7 @@ from .amplitudes import Amplitudes
 from .bands import BAND_ROWS, load_band
 from .global_fit import GlobalFit
 from .newton import gauss_newton
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _SHIFTS = 4  # Orders on both sides that a lone pixel is compared with
 
@@ -40,7 +40,7 @@ def slip_probability(found: GlobalFit, out: NDArray[np.float32] | None = None) -
 
 def lone_slip_probability(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     thickness_um: NDArray[np.float32],
     order_um: float,
     threads: int = 2,

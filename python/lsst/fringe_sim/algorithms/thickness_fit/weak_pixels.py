@@ -13,14 +13,14 @@ from .leaning import Leanings, lean_strip, local_variance
 from .local_surface import LocalSurface, local_surface
 from .pixels import CellSurface, PixelFit
 from .posterior import NODES, SHARE, chi2_about, nodes_about, settle_band, share_apart, widest_parabola
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _MOST_ASKED = 8192  # Pixels that show how many lie apart from their surface
 
 
 def settle_weak_pixels(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     surface: CellSurface,
     cells: Cells,
     pixels: PixelFit,
@@ -58,7 +58,7 @@ def settle_weak_pixels(
     return pixels, weak & np.isfinite(width)
 
 
-def _weak(templates: FringeTemplates, pixels: PixelFit, limit: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _weak(templates: FlatTemplates, pixels: PixelFit, limit: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Pixels whose likelihood is no parabola over their uncertainty."""
     place = (pixels.value - templates.start_um) / templates.step_um
     inside = (place >= 0.0) & (place <= len(limit) - 1.0)
@@ -68,7 +68,7 @@ def _weak(templates: FringeTemplates, pixels: PixelFit, limit: NDArray[np.float3
 
 def _leanings(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     cells: Cells,
     local: LocalSurface,
     cell_of_column: NDArray[np.int64],
@@ -94,7 +94,7 @@ def _leanings(
 
 def _settle_asked(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     pixels: PixelFit,
     asked: NDArray[np.bool_],
     surface: NDArray[np.float32],
@@ -120,7 +120,7 @@ def _settle_asked(
 
 def _share_apart(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     surface: NDArray[np.float32],
     width: NDArray[np.float32],
     order_um: float,
