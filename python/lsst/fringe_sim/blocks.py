@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .array_types import FloatArray
+
 
 def in_blocks(images: NDArray[Any], side: int) -> NDArray[Any]:
     """View of the last two axes as blocks of so many pixels along a side, ``(…, rows, side, columns, side)``."""
@@ -26,7 +28,7 @@ def block_means(images: NDArray[Any], side: int) -> NDArray[Any]:
     return images if side == 1 else np.asarray(in_blocks(images, side).mean(axis=(-3, -1)))
 
 
-def means_of_known(values: NDArray[np.float64], side: int) -> NDArray[np.float64]:
+def means_of_known(values: FloatArray, side: int) -> FloatArray:
     """Mean over the pixels of each block of one image that are numbers; NaN where none is."""
     if side == 1:
         return values

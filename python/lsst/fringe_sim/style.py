@@ -21,6 +21,7 @@ from mpl_toolkits.axes_grid1 import make_axes_locatable
 from numpy.typing import NDArray
 from PIL import Image
 
+from .array_types import FloatArray
 from .blocks import means_of_known
 
 SEQUENTIAL = "cividis"
@@ -217,6 +218,6 @@ def map_to_png(
     return pixels_to_png(numbers[::-1], np.rint(255.0 * palette).astype(np.uint8))
 
 
-def _thin(values: NDArray[np.float64], most_px: int) -> NDArray[np.float64]:
+def _thin(values: FloatArray, most_px: int) -> FloatArray:
     """Mean over square blocks, so that fringes do not alias when a large image is drawn small."""
     return means_of_known(values, max(1, min(values.shape) // most_px))

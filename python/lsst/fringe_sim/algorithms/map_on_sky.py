@@ -8,10 +8,9 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from ..array_types import FloatArray
+from ..array_types import Float32Array, FloatArray
 from ..blocks import block_sums
 from ..errors import InputError, named_units
 from ..notebook import do_nothing
@@ -96,7 +95,7 @@ def _cell_px(known: FloatArray, order_um: float) -> int:
     return cell
 
 
-def _pattern(dark: FrameTable, thickness_um: FloatArray) -> NDArray[np.float32]:
+def _pattern(dark: FrameTable, thickness_um: FloatArray) -> Float32Array:
     """The sky of a map, of mean 0: two that are a quarter of an order apart add up to that of any common shift."""
     good = np.isfinite(thickness_um)
     frame = dark.frame(thickness_um).astype(float)
@@ -104,10 +103,7 @@ def _pattern(dark: FrameTable, thickness_um: FloatArray) -> NDArray[np.float32]:
 
 
 def fringes_alone(
-    frame: ObservedFrame,
-    patterns: list[NDArray[np.float32]],
-    options: CorrectionOptions,
-    shape: tuple[int, ...],
+    frame: ObservedFrame, patterns: list[Float32Array], options: CorrectionOptions, shape: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray]:
     """A frame over its background, minus one, and its inverse variance, 0 in objects.
 

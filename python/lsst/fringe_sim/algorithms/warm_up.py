@@ -6,8 +6,8 @@ import functools
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import Float32Array, FloatArray
 from ..instrument.sky import SkySpectrum
 from ..model import FringeModel
 from ..model.response_table import ResponseTable
@@ -31,13 +31,13 @@ _ORDER_UM = 0.3
 _SETUP = "ts8_e2v"
 
 
-def _relief(side: int) -> NDArray[np.float64]:
+def _relief(side: int) -> FloatArray:
     """Thickness with a step, over which pixels have more than one surface to choose from [µm]."""
     y, x = np.mgrid[0:side, 0:side] / side
     return np.asarray(15.0 + 1.2 * x + 0.8 * y * y + np.where(x > 0.7, 0.45, 0.0))
 
 
-def _spoilt(image: NDArray[np.float64], noise: float) -> NDArray[np.float32]:
+def _spoilt(image: FloatArray, noise: float) -> Float32Array:
     """With noise, a bad column, one wavelength wrong here and there, and a patch where no thickness fits."""
     rng = np.random.default_rng(1)
     image = image + noise * rng.standard_normal(image.shape)

@@ -16,8 +16,7 @@ from .section import Context, Curve, Graph, PaperSection, columns, missing
 
 PERCENT = 100.0
 LAB_K = 183.0
-SHARP_NM = 0.1
-"""Bandwidth [nm] that leaves 97 % of the fringes of the silicon, with which those of 1 nm are compared."""
+SHARP_NM = 0.1  # Bandwidth [nm] that leaves 97 % of the fringes of the silicon, with which those of 1 nm are compared
 NINETY_NINE = float(np.log(100.0))  # Optical depths that absorb 99 %
 
 

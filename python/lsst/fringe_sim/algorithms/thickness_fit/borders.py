@@ -8,8 +8,8 @@ for every neighbour from which it would be torn off.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import BoolArray, Float32Array
 from ...compiled import kernel
 from .amplitudes import Amplitudes
 from .bands import gather_pixels
@@ -29,10 +29,10 @@ def settle_borders(
     data: Amplitudes,
     templates: FlatTemplates,
     pixels: PixelFit,
-    rough: NDArray[np.bool_],
+    rough: BoolArray,
     order_um: float,
     temper: float,
-) -> tuple[PixelFit, NDArray[np.float32]]:
+) -> tuple[PixelFit, Float32Array]:
     """Revise the pixels near steps.
 
     ``pixels``: what the pixels found by themselves; its arrays are revised in place; ``rough``: pixels that have

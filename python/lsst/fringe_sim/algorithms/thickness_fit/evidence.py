@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
+from ...array_types import Float32Array, FloatArray
 from ...compiled import kernel, run_threaded, subkernel
 from .cells import Cells
 from .newton import gauss_newton
@@ -36,17 +36,17 @@ class OrderEvidence(NamedTuple):
 
     # thickness of the best template moved by whole orders into the first order of the range [µm]; NaN where a cell
     # has no data, float32, ``(ncy, ncx)``
-    phase_um: NDArray[np.float32]
+    phase_um: Float32Array
     # slope_y, slope_x: slope of the thickness inside the cells, mean of 3 by 3 cells; the same for every order
     # [µm/px], float32, ``(ncy, ncx)``
-    slope_y: NDArray[np.float32]
-    slope_x: NDArray[np.float32]
-    best_um: NDArray[np.float32]  # thickness of the best template by itself [µm], float32, ``(ncy, ncx)``
-    chi2: NDArray[np.float32]  # its chi-square, float32, ``(ncy, ncx)``
+    slope_y: Float32Array
+    slope_x: Float32Array
+    best_um: Float32Array  # thickness of the best template by itself [µm], float32, ``(ncy, ncx)``
+    chi2: Float32Array  # its chi-square, float32, ``(ncy, ncx)``
     # chi-square of each order ``phase + m * order`` above that of the best, scaled down where the best itself fits
     # badly and where the noise of neighbouring cells is correlated; at most `EVIDENCE_CAP`, float32,
     # ``(ncy, ncx, n_orders)``
-    evidence: NDArray[np.float32]
+    evidence: Float32Array
     order_um: float  # thickness of one order [µm]
 
     def part(self, where: int | tuple[slice, slice]) -> OrderEvidence:
@@ -58,8 +58,8 @@ class OrderEvidence(NamedTuple):
 class _Nodes(NamedTuple):
     """Thicknesses at which cells are compared with templates."""
 
-    amplitude: NDArray[np.float32]  # ``(n_wavelengths, n_nodes)``
-    place: NDArray[np.float64]  # ascending [µm], ``(n_nodes,)``
+    amplitude: Float32Array  # ``(n_wavelengths, n_nodes)``
+    place: FloatArray  # ascending [µm], ``(n_nodes,)``
 
 
 def order_evidence(
@@ -95,7 +95,7 @@ def order_evidence(
     found = OrderEvidence(phase, slope_y, slope_x, best, chi2, evidence, order_um)
     grid = templates.grid()
 
-    def ask(row: int, step: int, centre: NDArray[np.float32], reach: int, limit: float) -> None:
+    def ask(row: int, step: int, centre: Float32Array, reach: int, limit: float) -> None:
         own, rises = (cells.value[row], cells.weight[row]), (cells.rise_y[row], cells.rise_x[row])
         _evidence_row(*own, rises, nodes, grid, temper, step, centre, reach, limit, found.part(row))
 
@@ -131,7 +131,7 @@ def _needed_reach(found: OrderEvidence) -> tuple[int, float]:
     return int(np.percentile(farthest, 99.9)) + _MARGIN_ORDERS, limit
 
 
-def _distrust_misfits(evidence: NDArray[np.float32], chi2: NDArray[np.float32]) -> None:
+def _distrust_misfits(evidence: Float32Array, chi2: Float32Array) -> None:
     """Take evidence from cells that fit worse than most: what spoils them favours some order by chance.
 
     Steep cells lose contrast, cells across a step are mixtures, and their neighbours err the same way.
@@ -318,7 +318,7 @@ def _evidence_row(value, weight, rises, nodes, grid, temper, stride, centre, rea
         slope_x[c] = step * _project(table, (thickness - start) / step, rises[1], weight, c)
 
 
-def _smooth(slope: NDArray[np.float32]) -> NDArray[np.float32]:
+def _smooth(slope: Float32Array) -> Float32Array:
     """Mean over 3 by 3 cells, leaving out those without a value: a slope inside one cell is noisy."""
     good = np.isfinite(slope)
     total = uniform_filter(np.where(good, slope, 0.0).astype(float), 3, mode="constant")
@@ -327,8 +327,8 @@ def _smooth(slope: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def refine_cells(
-    cells: Cells, templates: FlatTemplates, thickness_um: NDArray[np.float32], threads: int = 2
-) -> NDArray[np.float32]:
+    cells: Cells, templates: FlatTemplates, thickness_um: Float32Array, threads: int = 2
+) -> Float32Array:
     """Least chi-square of every cell near a given thickness; NaN stays NaN.
 
     ``thickness_um``: where to begin [µm], float32, ``(ncy, ncx)``.

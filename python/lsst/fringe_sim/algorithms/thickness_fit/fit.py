@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import Float32Array, FloatArray
 from ...compiled import kernel, one_blas_thread, processors, run_threaded
 from ...errors import InputError, OutOfRangeError, UnknownNameError, named_units
 from ...model import FringeModel
@@ -134,7 +134,7 @@ def fit_thickness(
     free = nuisances or Nuisances.automatic(contrast, model.setup.wavelength_accuracy_nm)
     free = replace(free, grid=model.setup.amplifier_grid)
     flats: FlatFit | None = None
-    coarse: NDArray[np.float32] | None = None
+    coarse: Float32Array | None = None
     notes: dict[str, Any] = {"METHOD": method, "RANGELO": low, "RANGEHI": high}
     notes["OBSERVAB"] = observable or model.base_system.observable
     if method == "guo2022":
@@ -158,12 +158,7 @@ def fit_thickness(
         notes |= {"ORDERUM": round(joint.found.order_um, 6), **joint.silicon.cards()}
     else:
         found = global_fit(
-            data,
-            templates,
-            range_um=(low, high),
-            cell_px=cell_px,
-            nuisances=free,
-            threads=workers,
+            data, templates, range_um=(low, high), cell_px=cell_px, nuisances=free, threads=workers
         )
         pixels = found.pixels
         slip = slip_probability(found, out=found.border_slip)
@@ -201,7 +196,7 @@ def amplitudes_from_cube(cube: FringeCube, noise_correlation_px: float | None = 
 
 def make_templates(
     model: FringeModel,
-    wavelength_nm: NDArray[np.float64],
+    wavelength_nm: FloatArray,
     range_um: tuple[float, float],
     observable: str | None = None,
 ) -> FlatTemplates:
@@ -248,11 +243,11 @@ def make_templates(
 
 def _turn_beside(
     model: FringeModel,
-    wavelength_nm: NDArray[np.float64],
-    response: NDArray[np.float64],
-    group: NDArray[np.float64],
+    wavelength_nm: FloatArray,
+    response: FloatArray,
+    group: FloatArray,
     grid_um: tuple[float, float],
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """What the thin layers beside the varying one add to how its fringe turns, as `FlatTemplates` takes it.
 
     The derivative of the response in wavelength is that in thickness times a straight line in thickness, whose slope
@@ -305,7 +300,7 @@ def _repeated_walk(
 
 def _assemble(
     pixels: PixelFit,
-    slip: NDArray[np.float32],
+    slip: Float32Array,
     slip_limit: float,
     cube: FringeCube,
     layer: str,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import Float32Array
 from .amplitudes import Amplitudes
 from .borders import settle_borders
 from .cell_size import choose_cell_size
@@ -34,7 +35,7 @@ class GlobalFit:
     settled: SettledCells  # order of every cell, and how sure it is
     # probability that a pixel near a step lies on the other side of it, or that one which was fitted by itself has
     # another order, float32, ``(ny, nx)``
-    border_slip: NDArray[np.float32]
+    border_slip: Float32Array
     templates: FlatTemplates  # the model as it was normalised in the end
     nuisance: NuisanceFit  # patterns and contrast beside the fringes
     order_um: float  # thickness of one fringe order [µm]
@@ -45,7 +46,7 @@ class GlobalFit:
     # chi-square by which the next best order of the whole sensor is worse, where nuisances are free
     margin: float = np.inf
     # contrast in blocks of the sensor, over that of the sensor, float32
-    contrast_map: NDArray[np.float32] = field(default_factory=lambda: np.ones((1, 1), np.float32))
+    contrast_map: Float32Array = field(default_factory=lambda: np.ones((1, 1), np.float32))
 
 
 def global_fit(

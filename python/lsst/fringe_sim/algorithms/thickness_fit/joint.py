@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...array_types import FloatArray
+from ...array_types import Float32Array, FloatArray
 from ...compiled import kernel, run_threaded, subkernel
 from .amplitudes import Amplitudes
 from .bands import BAND_ROWS, gather_pixels, load_band
@@ -34,7 +33,7 @@ class JointFit:
     """Adhesive of every pixel, and silicon of the sensor."""
 
     pixels: PixelFit  # the adhesive. Its uncertainty contains that of the silicon
-    slip: NDArray[np.float32]  # probability that the order of a pixel is wrong, float32, ``(ny, nx)``
+    slip: Float32Array  # probability that the order of a pixel is wrong, float32, ``(ny, nx)``
     silicon: SiliconFit  # the silicon. If it is not decided, its fringes counted as noise of the flats
     found: GlobalFit  # the fit in which the orders of the adhesive were solved
 
@@ -87,19 +86,14 @@ def _unknown(search: SiliconSearch, wavelengths: int) -> SiliconFit:
     return SiliconFit(search, np.zeros(terms), np.zeros((terms, terms)), 0.0, 1.0, forecast)
 
 
-def _believed(pixels: PixelFit, slip: NDArray[np.float32]) -> NDArray[np.float32]:
+def _believed(pixels: PixelFit, slip: Float32Array) -> Float32Array:
     """Thickness where the order is sure; NaN elsewhere."""
     good = (slip < _SURE) & np.isfinite(pixels.value) & np.isfinite(pixels.sigma)
     return np.where(good, pixels.value, np.float32(np.nan))
 
 
 def _fit_pixels(
-    data: Amplitudes,
-    model: SiliconModel,
-    silicon: SiliconFit,
-    start: PixelFit,
-    order_um: float,
-    threads: int,
+    data: Amplitudes, model: SiliconModel, silicon: SiliconFit, start: PixelFit, order_um: float, threads: int
 ) -> PixelFit:
     """Adhesive of every pixel at the silicon of its place."""
     shape = start.value.shape
@@ -127,7 +121,7 @@ def _fit_pixels(
 
 
 def _mean_response(
-    data: Amplitudes, tables: SiliconTables, start: PixelFit, offset: NDArray[np.float32]
+    data: Amplitudes, tables: SiliconTables, start: PixelFit, offset: Float32Array
 ) -> FloatArray:
     """Response by which a flat over its mean is to be multiplied: means of model and flat over the same pixels."""
     ny, nx = start.value.shape

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...array_types import BoolArray, FloatArray
+from ...array_types import BoolArray, Float32Array, FloatArray
 from ...compiled import kernel
 from .newton import score
 
@@ -39,10 +39,7 @@ class Leanings(NamedTuple):
 
 
 def local_variance(
-    seen: Leanings,
-    surface_variance: FloatArray,
-    widths: tuple[float, float],
-    independence: float = 1.0,
+    seen: Leanings, surface_variance: FloatArray, widths: tuple[float, float], independence: float = 1.0
 ) -> FloatArray:
     """Expected square of the distance of the pixels of each cell from their surface, beyond all noise.
 
@@ -95,9 +92,7 @@ def responsibility(likely: NDArray[np.floating], share: NDArray[np.floating]) ->
     return np.asarray(mixed / mixed.sum(axis=1, keepdims=True))
 
 
-def _with_neighbours(
-    likely: NDArray[np.float32], share: NDArray[np.float32], known: BoolArray
-) -> NDArray[np.float32]:
+def _with_neighbours(likely: Float32Array, share: Float32Array, known: BoolArray) -> Float32Array:
     """What is expected of each ``known`` cell before it is asked: ``share``, and what those around it show."""
     place = np.full(np.add(known.shape, 2 * _REACH), len(likely))
     place[_REACH:-_REACH, _REACH:-_REACH][known] = np.arange(len(likely))
@@ -107,7 +102,7 @@ def _with_neighbours(
     ]
     count = (np.stack(neighbours, axis=1) < len(likely)).sum(axis=1, keepdims=True, dtype=np.float32)
     shown = np.zeros((len(likely) + 1, share.size), np.float32)
-    expected: NDArray[np.float32] = np.broadcast_to(share, likely.shape)
+    expected: Float32Array = np.broadcast_to(share, likely.shape)
     for _ in range(_ROUNDS_AROUND):
         shown[:-1] = responsibility(likely, expected)
         beside, best = np.zeros_like(likely), -np.inf
@@ -122,12 +117,8 @@ def _with_neighbours(
 
 
 def _likelihood(
-    seen: Leanings,
-    surface_variance: FloatArray,
-    together: FloatArray,
-    alone: FloatArray,
-    independence: float,
-) -> NDArray[np.float32]:
+    seen: Leanings, surface_variance: FloatArray, together: FloatArray, alone: FloatArray, independence: float
+) -> Float32Array:
     """Likelihood of each pair of squared widths in each cell that has pixels, relative to the largest."""
     known = seen.number > 0
     n, total, information, squares, surface = (

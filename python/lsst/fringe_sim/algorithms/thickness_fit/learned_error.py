@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...array_types import BoolArray, FloatArray
+from ...array_types import BoolArray, Float32Array, FloatArray
 from .cells import Cells
 from .learning import moves_of
 from .learning_cells import LearningCells
@@ -30,7 +30,7 @@ def learned_sigma(
     free: Nuisances,
     fit: NuisanceFit,
     order_um: float,
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Standard uncertainty of the thickness of every pixel from all that was learned but the scale [µm].
 
     ``leaning``: pixels that have the surface of the cells as their prior, bool, ``(ny, nx)``; ``order_um``:

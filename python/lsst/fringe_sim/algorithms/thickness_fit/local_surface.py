@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.special import gammaincinv
 
-from ...array_types import BoolArray, FloatArray
+from ...array_types import BoolArray, Float32Array, FloatArray
 from ...compiled import kernel
 from .cells import Cells
 from .leaning import most_likely_shares, responsibility
@@ -47,21 +47,17 @@ class LocalSurface:
     """Surface about each cell."""
 
     # of 1, y, x, y², xy, x², with y and x in pixels from the centre of the cell [µm], float32, ``(ncy, ncx, 6)``
-    terms: NDArray[np.float32]
+    terms: Float32Array
     # standard uncertainty of the first [µm]: the noise of the cells, and what they leave over beyond that of most;
     # infinite where nobody asked, float32, ``(ncy, ncx)``
-    sigma_um: NDArray[np.float32]
+    sigma_um: Float32Array
     # whether the cell and its eight neighbours lie on their surfaces, and more cells show it than it has terms,
     # bool, ``(ncy, ncx)``
     holds: BoolArray
 
 
 def local_surface(
-    surface: CellSurface,
-    cells: Cells,
-    templates: FlatTemplates,
-    asked: BoolArray,
-    order_um: float,
+    surface: CellSurface, cells: Cells, templates: FlatTemplates, asked: BoolArray, order_um: float
 ) -> LocalSurface:
     """The most likely surfaces about the cells that are asked.
 
@@ -152,11 +148,7 @@ def _allow_for_misfit(found: LocalSurface, asked: BoolArray, misfit: FloatArray)
 
 
 def shares_of_middle(
-    surface: CellSurface,
-    precision: FloatArray,
-    y: NDArray[np.intp],
-    x: NDArray[np.intp],
-    order_um: float,
+    surface: CellSurface, precision: FloatArray, y: NDArray[np.intp], x: NDArray[np.intp], order_um: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
     """Rows and columns of the cells about some, and the share of each in the surface of the one in the middle."""
     b, a, known, design, _ = _window(surface, precision, y, x)

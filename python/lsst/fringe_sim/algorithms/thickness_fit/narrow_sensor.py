@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...array_types import FloatArray
+from ...array_types import Float32Array, FloatArray
 from ...compiled import kernel, run_threaded, subkernel
 from .cells import Cells
 from .evidence import refine_row
@@ -60,7 +60,7 @@ class NarrowSensor:
     cell: NDArray[np.intp]  # which cells were asked, counted row by row, ``(n,)``
     cell_um: FloatArray  # their thickness [µm], ``(n,)``
 
-    def agrees_with(self, thickness_um: NDArray[np.float32], order_um: float) -> bool:
+    def agrees_with(self, thickness_um: Float32Array, order_um: float) -> bool:
         """Whether a map has the same orders where cells were asked, but for a few of them."""
         miss = np.abs(thickness_um.ravel()[self.cell] - self.cell_um)
         return bool(np.mean(miss < _SAME_SOLUTION * order_um) > 1.0 - _FEW_ASTRAY)
@@ -79,7 +79,7 @@ def is_own_mean(cells: Cells, templates: FlatTemplates) -> bool:
 def settle_narrow_sensor(
     cells: Cells,
     templates: FlatTemplates,
-    ideas_um: Sequence[NDArray[np.float32]],
+    ideas_um: Sequence[Float32Array],
     order_um: float,
     *,
     range_um: tuple[float, float],
@@ -161,14 +161,14 @@ class _Sample:
     the model are divided by may be compared.
     """
 
-    level: NDArray[np.float32]
-    weight: NDArray[np.float32]
+    level: Float32Array
+    weight: Float32Array
     share: FloatArray
     cell: NDArray[np.intp]
 
     @classmethod
     def of(
-        cls, cells: Cells, ideas_um: Sequence[NDArray[np.float32]], wavelengths: int, most: int
+        cls, cells: Cells, ideas_um: Sequence[Float32Array], wavelengths: int, most: int
     ) -> tuple[_Sample, FloatArray, FloatArray]:
         """Cells at equal distances that have most wavelengths, their thickness about its middle, and that middle.
 

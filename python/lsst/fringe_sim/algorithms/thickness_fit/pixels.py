@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, uniform_filter
 
+from ...array_types import BoolArray, Float32Array, FloatArray
 from ...compiled import kernel, run_threaded, subkernel
 from .amplitudes import Amplitudes
 from .bands import BAND_ROWS, load_band
@@ -33,9 +34,9 @@ class PixelFit(NamedTuple):
     """Result for every pixel; NaN (and 0 wavelengths) where there was nothing to fit."""
 
     # value, sigma: thickness and its standard uncertainty [µm], float32, ``(ny, nx)``
-    value: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-    chi2: NDArray[np.float32]  # reduced chi-square, float32, ``(ny, nx)``
+    value: Float32Array
+    sigma: Float32Array
+    chi2: Float32Array  # reduced chi-square, float32, ``(ny, nx)``
     n_wavelengths: NDArray[np.int32]  # number of wavelengths used, int32, ``(ny, nx)``
 
     def rows(self, part: slice) -> PixelFit:
@@ -48,33 +49,31 @@ class CellSurface(NamedTuple):
 
     # thickness_um, slope_y, slope_x: thickness at the centre [µm] and its slopes [µm/px]; finite everywhere,
     # float32, ``(ncy, ncx)``
-    thickness_um: NDArray[np.float32]
-    slope_y: NDArray[np.float32]
-    slope_x: NDArray[np.float32]
+    thickness_um: Float32Array
+    slope_y: Float32Array
+    slope_x: Float32Array
     # y_centre, x_centre: centres of the cells [px]
-    y_centre: NDArray[np.float64]
-    x_centre: NDArray[np.float64]
-    smooth: NDArray[
-        np.bool_
-    ]  # whether a cell and its eight neighbours lie on one surface, bool, ``(ncy, ncx)``
+    y_centre: FloatArray
+    x_centre: FloatArray
+    smooth: BoolArray  # whether a cell and its eight neighbours lie on one surface, bool, ``(ncy, ncx)``
     # whether a cell has data; the thickness of the others is borrowed, and no evidence for a surface, bool,
     # ``(ncy, ncx)``
-    known: NDArray[np.bool_]
+    known: BoolArray
     # standard uncertainty of the thickness from the noise of the flats [µm]; infinite where it is not known,
     # float32, ``(ncy, ncx)``
-    sigma_um: NDArray[np.float32]
+    sigma_um: Float32Array
 
     @classmethod
     def from_cells(
         cls,
-        thickness_um: NDArray[np.float32],
+        thickness_um: Float32Array,
         slope_y: NDArray[np.floating],
         slope_x: NDArray[np.floating],
-        y_centre: NDArray[np.float64],
-        x_centre: NDArray[np.float64],
+        y_centre: FloatArray,
+        x_centre: FloatArray,
         order_um: float,
-        known: NDArray[np.bool_],
-        sigma_um: NDArray[np.float32],
+        known: BoolArray,
+        sigma_um: Float32Array,
     ) -> Self:
         """Find out which cells lie on one surface."""
         rise = np.diff(y_centre)[:, None] * 0.5 * (slope_y[1:] + slope_y[:-1])
@@ -98,7 +97,7 @@ class CellSurface(NamedTuple):
             sigma_um,
         )
 
-    def at(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
+    def at(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Float32Array:
         """Bilinear surface at some rows and columns of pixels, shape ``(len(rows), len(columns))`` [µm]."""
         below_y, share_y = (part[rows] for part in bracket(self.y_centre, int(rows.max()) + 1))
         below_x, share_x = (part[columns] for part in bracket(self.x_centre, int(columns.max()) + 1))
@@ -129,8 +128,7 @@ def calm_surface(surface: CellSurface, threads: int = 2) -> CellSurface:
     # The median of independent normal numbers about one value, each of an uncertainty of its own.
     sigma = np.sqrt(0.5 * np.pi * np.maximum(number, 0.0)) / np.maximum(total, 1e-30)
     return surface._replace(
-        thickness_um=out,
-        sigma_um=np.where(surface.smooth, sigma, surface.sigma_um).astype(np.float32),
+        thickness_um=out, sigma_um=np.where(surface.smooth, sigma, surface.sigma_um).astype(np.float32)
     )
 
 
@@ -153,12 +151,7 @@ def _calm_row(surface, row, out):  # type: ignore[no-untyped-def]
 
 
 def fit_pixels(
-    data: Amplitudes,
-    templates: FlatTemplates,
-    surface: CellSurface,
-    order_um: float,
-    *,
-    threads: int = 2,
+    data: Amplitudes, templates: FlatTemplates, surface: CellSurface, order_um: float, *, threads: int = 2
 ) -> PixelFit:
     """Refine every pixel.
 
@@ -180,7 +173,7 @@ def fit_pixels(
     return found
 
 
-def bracket(centre: NDArray[np.float64], length: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def bracket(centre: FloatArray, length: int) -> tuple[NDArray[np.int64], Float32Array]:
     """For each pixel the cell centre below it, and how far it is to the next (outside 0..1: beyond the ends)."""
     if len(centre) == 1:
         return np.zeros(length, np.int64), np.zeros(length, np.float32)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import Float32Array, FloatArray
 from ...compiled import kernel
 from .newton import score
 from .templates import FlatTemplates
@@ -30,14 +31,12 @@ _ROUNDS = 30
 """Steps of expectation and maximisation for the share of pixels that lie apart, then good to a few per cent."""
 
 
-def nodes_about(order: float) -> NDArray[np.float64]:
+def nodes_about(order: float) -> FloatArray:
     """Distances of the nodes from the surface, in the unit of ``order``, which is one fringe order."""
     return AWAY * REACH * order
 
 
-def widest_parabola(
-    templates: FlatTemplates, weight: NDArray[np.floating], order_um: float
-) -> NDArray[np.float32]:
+def widest_parabola(templates: FlatTemplates, weight: NDArray[np.floating], order_um: float) -> Float32Array:
     """Largest uncertainty at each thickness, in steps of the table, for which the likelihood is a parabola.
 
     It has to be one over three standard deviations, and these must not reach into the next order. The weights are
@@ -47,10 +46,7 @@ def widest_parabola(
     information = np.gradient(templates.amplitude(), axis=0) ** 2 @ np.asarray(weight, dtype=float)
     limit = np.full(information.shape, reach / 3.0, np.float32)
     for move in range(1, reach + 1):
-        for here, there in (
-            (slice(move, None), slice(None, -move)),
-            (slice(None, -move), slice(move, None)),
-        ):
+        for here, there in ((slice(move, None), slice(None, -move)), (slice(None, -move), slice(move, None))):
             changed = np.abs(information[there] - information[here]) > _CHANGE * information[here]
             limit[here][changed] = np.minimum(limit[here][changed], np.float32(move / 3.0))
     return limit

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from ...array_types import Float32Array
 from ...compiled import kernel
 from .amplitudes import Amplitudes
 from .bands import gather_pixels
@@ -29,7 +30,7 @@ _MOST_SEARCHED = 200_000
 _SAMPLE = 400_000  # Pixels from which the typical misfit is taken
 
 
-def chi2_limits(most: int) -> NDArray[np.float32]:
+def chi2_limits(most: int) -> Float32Array:
     """Reduced chi-square that is exceeded with `SUSPECT_PROBABILITY`, by number of wavelengths 0 ... ``most``."""
     degrees = np.maximum(np.arange(most + 1) - 1, 1)
     return (chdtri(degrees, SUSPECT_PROBABILITY) / degrees).astype(np.float32)
@@ -39,7 +40,7 @@ def rescue_pixels(
     data: Amplitudes,
     templates: FlatTemplates,
     pixels: PixelFit,
-    slip: NDArray[np.float32],
+    slip: Float32Array,
     order_um: float,
     *,
     range_um: tuple[float, float],
@@ -157,12 +158,12 @@ def _leave_one_out(value, weight, rows, columns, grid, order, bad, limit, pixels
 
 def _take_what_fits(
     found: OrderEvidence,
-    weight: NDArray[np.float32],
+    weight: Float32Array,
     place: tuple[NDArray[np.intp], NDArray[np.intp]],
     templates: FlatTemplates,
-    limit: NDArray[np.float32],
+    limit: Float32Array,
     pixels: PixelFit,
-    slip: NDArray[np.float32],
+    slip: Float32Array,
 ) -> None:
     """Keep what pixels have found by themselves over the whole range, where it fits, in place."""
     used = np.count_nonzero(weight > 0, axis=1)

@@ -8,8 +8,8 @@ leave over, then the sum over many pixels says nothing about which of the two is
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import Float32Array, FloatArray
 from .amplitudes import Amplitudes
 from .bands import gather_pixels
 from .cells import Cells
@@ -27,7 +27,7 @@ _APART = 4.0
 
 
 def doubt_from_shared_misfit(
-    data: Amplitudes, templates: FlatTemplates, thickness_um: NDArray[np.float32], order_um: float
+    data: Amplitudes, templates: FlatTemplates, thickness_um: Float32Array, order_um: float
 ) -> float:
     """Probability that a solution is wrong, if all of its shared misfit has one cause.
 
@@ -92,7 +92,7 @@ def leaves_only_noise(data: Amplitudes, templates: FlatTemplates, surface: CellS
     return _is_noise((pulls[0] * pulls[1]).sum(axis=1))
 
 
-def cells_leave_only_noise(cells: Cells, templates: FlatTemplates, thickness_um: NDArray[np.float32]) -> bool:
+def cells_leave_only_noise(cells: Cells, templates: FlatTemplates, thickness_um: Float32Array) -> bool:
     """Whether what a model leaves over in neighbouring cells has nothing in common.
 
     A cell has less noise than its pixels: fringes so weak that no pixel shows them are seen in cells. Taken for the
@@ -105,7 +105,7 @@ def cells_leave_only_noise(cells: Cells, templates: FlatTemplates, thickness_um:
     return _is_noise((pulls[:, 1:] * pulls[:, :-1]).sum(axis=-1).ravel())
 
 
-def _is_noise(product: NDArray[np.float64]) -> bool:
+def _is_noise(product: FloatArray) -> bool:
     """Whether products of neighbours scatter about zero."""
     product = product[np.isfinite(product)]
     if product.size == 0:
@@ -116,11 +116,8 @@ def _is_noise(product: NDArray[np.float64]) -> bool:
 
 
 def _pull(
-    templates: FlatTemplates,
-    value: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    thickness_um: NDArray[np.float32],
-) -> NDArray[np.float64]:
+    templates: FlatTemplates, value: Float32Array, weight: Float32Array, thickness_um: Float32Array
+) -> FloatArray:
     """What a thickness leaves over, in standard deviations, shape ``(n, n_wavelengths)``; 0 without data."""
     wavelengths = templates.n_wavelengths
     miss = value[:, :wavelengths] - templates.amplitude_at(thickness_um).T

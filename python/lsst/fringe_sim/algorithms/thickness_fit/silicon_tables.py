@@ -6,17 +6,15 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...array_types import FloatArray
+from ...array_types import Float32Array, FloatArray
 from ...errors import InputError
 from ...model import FringeModel
 from .amplitudes import Amplitudes
 from .templates import FlatTemplates, pad_wavelengths
 
 OFFSET = "silicon_thickness.offset"
-SCAN_PER_ORDER = 12
-"""Tables in one order of the silicon of a scan."""
+SCAN_PER_ORDER = 12  # Tables in one order of the silicon of a scan
 NODES_PER_ORDER = 100
 """Thicknesses in one order of the adhesive; linear interpolation is good to 5e-4 of its fringes."""
 
@@ -25,7 +23,7 @@ class SiliconTables(NamedTuple):
     """Response against the adhesive for several thicknesses of the silicon."""
 
     # response; 0 in the padding, float32, ``(n_silicon, n_thickness, padded wavelengths)``
-    response: NDArray[np.float32]
+    response: Float32Array
     # silicon_start_um, silicon_step_um: first silicon, relative to that of the model, and spacing [µm]
     silicon_start_um: float
     silicon_step_um: float

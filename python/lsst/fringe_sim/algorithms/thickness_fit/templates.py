@@ -9,7 +9,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...array_types import FloatArray
+from ...array_types import Float32Array, FloatArray
 from ...errors import InputError, OutOfRangeError
 
 LANES = 8  # Wavelength axes are padded to a multiple of this, so that inner loops fill the vector registers
@@ -18,7 +18,7 @@ LANES = 8  # Wavelength axes are padded to a multiple of this, so that inner loo
 class Grid(NamedTuple):
     """Templates as compiled loops take them."""
 
-    table: NDArray[np.float32]  # `FlatTemplates.table`
+    table: Float32Array  # `FlatTemplates.table`
     # start, step: first thickness and spacing [µm]
     start: float
     step: float
@@ -127,7 +127,7 @@ class FlatTemplates:
             factor = factor * np.exp(-self.fading * (self.thickness_um - self.middle_um))[:, None]
         return np.asarray(factor * (self.response / self.mean_response - 1.0))
 
-    def table(self) -> NDArray[np.float32]:
+    def table(self) -> Float32Array:
         """`amplitude` as float32 with the wavelength axis padded by zeros to a multiple of `LANES`."""
         return pad_wavelengths(self.amplitude())
 
@@ -282,7 +282,7 @@ class FlatTemplates:
         return float((peak + offset) * self.step_um)
 
 
-def pad_wavelengths(values: NDArray[np.floating]) -> NDArray[np.float32]:
+def pad_wavelengths(values: NDArray[np.floating]) -> Float32Array:
     """Copy to float32 with zeros appended to the last axis up to a multiple of `LANES`."""
     width = values.shape[-1]
     padded = -(-width // LANES) * LANES

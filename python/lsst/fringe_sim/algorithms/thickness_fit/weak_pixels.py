@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import BoolArray, Float32Array
 from ...compiled import run_threaded
 from .amplitudes import Amplitudes
 from .bands import BAND_ROWS, gather_pixels, load_band
@@ -27,7 +28,7 @@ def settle_weak_pixels(
     order_um: float,
     *,
     threads: int = 2,
-) -> tuple[PixelFit, NDArray[np.bool_]]:
+) -> tuple[PixelFit, BoolArray]:
     """Give pixels that do not tell their thickness by themselves the surface of the cells as a prior.
 
     ``pixels``: what the pixels found by themselves; its arrays are revised in place; ``order_um``: thickness of one
@@ -58,7 +59,7 @@ def settle_weak_pixels(
     return pixels, weak & np.isfinite(width)
 
 
-def _weak(templates: FlatTemplates, pixels: PixelFit, limit: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _weak(templates: FlatTemplates, pixels: PixelFit, limit: Float32Array) -> BoolArray:
     """Pixels whose likelihood is no parabola over their uncertainty."""
     place = (pixels.value - templates.start_um) / templates.step_um
     inside = (place >= 0.0) & (place <= len(limit) - 1.0)
@@ -73,7 +74,7 @@ def _leanings(
     local: LocalSurface,
     cell_of_column: NDArray[np.int64],
     threads: int,
-) -> tuple[NDArray[np.float32], Leanings]:
+) -> tuple[Float32Array, Leanings]:
     """The surface at each pixel [µm], and what the pixels of each cell show about it."""
     begin, sums = np.zeros(data.shape[1:], np.float32), np.zeros((4, *cells.shape))
     grid = templates.grid()
@@ -96,9 +97,9 @@ def _settle_asked(
     data: Amplitudes,
     templates: FlatTemplates,
     pixels: PixelFit,
-    asked: NDArray[np.bool_],
-    surface: NDArray[np.float32],
-    width: NDArray[np.float32],
+    asked: BoolArray,
+    surface: Float32Array,
+    width: Float32Array,
     apart: float,
     order_um: float,
     threads: int,
@@ -119,11 +120,7 @@ def _settle_asked(
 
 
 def _share_apart(
-    data: Amplitudes,
-    templates: FlatTemplates,
-    surface: NDArray[np.float32],
-    width: NDArray[np.float32],
-    order_um: float,
+    data: Amplitudes, templates: FlatTemplates, surface: Float32Array, width: Float32Array, order_um: float
 ) -> float:
     """Share of pixels apart from their surface that some of those with a surface show."""
     found = np.flatnonzero(np.isfinite(width))
