@@ -1,4 +1,9 @@
-"""Thickness maps from flats at many wavelengths: a global fit, and the walk of the paper as its peer."""
+"""Thickness maps from flats at many wavelengths: a global fit, and the walk of the paper as its peer.
+
+Inside, ``order_um`` is the thickness of one fringe order [µm], ``range_um`` the thicknesses that are possible [µm],
+and ``temper`` the number of independent cells per cell, or pixels per pixel: below 1 where the noise of neighbours is
+correlated.
+"""
 
 from ..thickness_fit_options import SILICON_FIELDS
 from .amplitudes import Amplitudes

@@ -35,11 +35,9 @@ def settle_borders(
 ) -> tuple[PixelFit, Float32Array]:
     """Revise the pixels near steps.
 
-    ``pixels``: what the pixels found by themselves; its arrays are revised in place; ``rough``: pixels that have
-    more than one surface within reach, bool, ``(ny, nx)``; ``order_um``: thickness of one fringe order [µm];
-    ``temper``: independent pixels per pixel: below 1 where the noise is correlated. Returns ``pixels``: the revised
-    fit; ``slip``: probability that a pixel lies on another of the surfaces; 0 where there is only one, float32,
-    ``(ny, nx)``.
+    ``pixels``: what the pixels found by themselves; its arrays are revised in place; ``rough``: pixels that have more
+    than one surface within reach, bool, ``(ny, nx)``. Returns ``pixels``: the revised fit; ``slip``: probability that
+    a pixel lies on another of the surfaces; 0 where there is only one, float32, ``(ny, nx)``.
     """
     slip = np.zeros(rough.shape, np.float32)
     rows, columns = np.nonzero(rough & (pixels.n_wavelengths > 0))

@@ -159,9 +159,9 @@ def compensate_slopes(
     direction; a slope that is taken from the two halves of a cell is too small by this and by the same loss over
     half a cell.
 
-    ``slope_y, slope_x``: slopes of the thickness as found from the halves [µm/px], float32, ``(ncy, ncx)``;
-    ``order_um``: thickness of one fringe order [µm]. Returns ``cells``: the cells with amplitudes divided by
-    the loss, and weights to match; ``slope_y, slope_x``: corrected slopes.
+    ``slope_y, slope_x``: slopes of the thickness as found from the halves [µm/px], float32, ``(ncy, ncx)``. Returns
+    ``cells``: the cells with amplitudes divided by the loss, and weights to match; ``slope_y, slope_x``: corrected
+    slopes.
     """
     turn_y = slope_y * np.diff(cells.y_edges)[:, None] / order_um
     turn_x = slope_x * np.diff(cells.x_edges)[None, :] / order_um

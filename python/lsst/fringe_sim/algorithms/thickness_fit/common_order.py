@@ -35,10 +35,7 @@ def rank_orders(
     order_um: float,
     range_um: tuple[float, float],
 ) -> CommonOrder:
-    """Compare the orders of a whole sensor: each with the light, contrast and wavelengths that it needs.
-
-    ``order_um``: thickness of one order [µm]; ``range_um``: thicknesses that are possible [µm].
-    """
+    """Compare the orders of a whole sensor: each with the light, contrast and wavelengths that it needs."""
     thickness, here = learn(cells, base, free, start)
     if not np.isfinite(
         here.chi2

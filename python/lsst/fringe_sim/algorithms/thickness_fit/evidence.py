@@ -71,11 +71,7 @@ def order_evidence(
     temper: float = 1.0,
     threads: int = 2,
 ) -> OrderEvidence:
-    """Compare every cell with templates over the whole range.
-
-    ``order_um``: thickness of one fringe order [µm]; ``range_um``: thicknesses that are possible [µm]; ``temper``:
-    independent cells per cell: below 1 where the noise of neighbouring cells is correlated.
-    """
+    """Compare every cell with templates over the whole range."""
     low = max(round((range_um[0] - templates.start_um) / templates.step_um), 0)
     high = min(round((range_um[1] - templates.start_um) / templates.step_um), len(templates.response) - 1)
     amplitude = templates.amplitude()[low : high + 1]

@@ -33,8 +33,8 @@ def learned_sigma(
 ) -> Float32Array:
     """Standard uncertainty of the thickness of every pixel from all that was learned but the scale [µm].
 
-    ``leaning``: pixels that have the surface of the cells as their prior, bool, ``(ny, nx)``; ``order_um``:
-    thickness of one fringe order [µm]. Returns float32, ``(ny, nx)``.
+    ``leaning``: pixels that have the surface of the cells as their prior, bool, ``(ny, nx)``. Returns float32,
+    ``(ny, nx)``.
     """
     if fit.covariance.size == 0 or not surface.known.any():
         return np.zeros(leaning.shape, np.float32)

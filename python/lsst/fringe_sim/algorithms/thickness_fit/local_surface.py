@@ -61,8 +61,7 @@ def local_surface(
 ) -> LocalSurface:
     """The most likely surfaces about the cells that are asked.
 
-    ``asked``: cells whose surface is wanted, bool, ``(ncy, ncx)``; ``order_um``: thickness of one fringe order
-    [µm].
+    ``asked``: cells whose surface is wanted, bool, ``(ncy, ncx)``.
     """
     terms, sigma = np.zeros((*asked.shape, 6), np.float32), np.full(asked.shape, np.inf, np.float32)
     found = LocalSurface(terms, sigma, np.zeros(asked.shape, bool))

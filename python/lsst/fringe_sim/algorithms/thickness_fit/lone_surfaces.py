@@ -44,11 +44,9 @@ def settle_lone_surfaces(
     """Give every lone surface the order that all its cells together prefer.
 
     ``thickness_um``: thickness so far [µm]; NaN where a cell has no data, float32, ``(ncy, ncx)``; ``segment``:
-    number of the surface each cell lies on; -1 where a cell has no data, int32, ``(ncy, ncx)``; ``independence``:
-    how much more independent the cells of each surface are than ``temper`` says, ``(n_segments,)``; ``order_um``:
-    thickness of one fringe order [µm]; ``range_um``: thicknesses that are possible [µm]; ``temper``: independent
-    cells per cell, as for `order_evidence`; ``most_cells``: largest surface that is looked at; larger ones have
-    cells enough.
+    number of the surface each cell lies on; -1 where a cell has no data, int32, ``(ncy, ncx)``; ``independence``: how
+    much more independent the cells of each surface are than ``temper`` says, ``(n_segments,)``; ``most_cells``:
+    largest surface that is looked at; larger ones have cells enough.
     """
     surface = np.flatnonzero(_are_lone(segment) & (np.bincount(segment[segment >= 0]) <= most_cells))
     member = np.flatnonzero(np.isin(segment, surface))

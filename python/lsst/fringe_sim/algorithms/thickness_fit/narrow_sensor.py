@@ -91,9 +91,7 @@ def settle_narrow_sensor(
 
     ``ideas_um``: ideas of the thickness [µm], of which the shape is used; NaN where a cell has no data. The shape
     that is true within half an order everywhere must be among them, or the result may be wrong, float32,
-    ``(ncy, ncx)``; ``order_um``: thickness of one fringe order [µm]; ``range_um``: possible thicknesses [µm];
-    ``temper``: independent cells per cell, as for `order_evidence`; ``earlier``: solutions from other ideas, which
-    compete with the new ones.
+    ``(ncy, ncx)``; ``earlier``: solutions from other ideas, which compete with the new ones.
     """
     sample, shapes_um, middles_um = _Sample.of(cells, ideas_um, templates.n_wavelengths, _MOST_CELLS)
     stride = max(shapes_um.shape[1] // _FEW_CELLS, 1)

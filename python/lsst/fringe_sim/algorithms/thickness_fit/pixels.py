@@ -153,10 +153,7 @@ def _calm_row(surface, row, out):  # type: ignore[no-untyped-def]
 def fit_pixels(
     data: Amplitudes, templates: FlatTemplates, surface: CellSurface, order_um: float, *, threads: int = 2
 ) -> PixelFit:
-    """Refine every pixel.
-
-    ``order_um``: thickness of one fringe order [µm].
-    """
+    """Refine every pixel."""
     _, ny, nx = data.shape
     value, sigma, chi2 = (np.empty((ny, nx), np.float32) for _ in range(3))
     found = PixelFit(value, sigma, chi2, np.zeros((ny, nx), np.int32))

@@ -58,9 +58,8 @@ def share_apart(chi2: NDArray[np.floating], spread_um: NDArray[np.floating], ord
     That some lie apart is believed if it makes the flats more likely than a free parameter does by itself (Schwarz
     1978, Ann. Stat. 6, 461).
 
-    ``chi2``: of each pixel, at the nodes about the surface, ``(n_pixels, NODES)``; ``spread_um``: standard
-    deviation of the pixels that follow the surface [µm], ``(n_pixels,)``; ``order_um``: thickness of one fringe
-    order [µm].
+    ``chi2``: of each pixel, at the nodes about the surface, ``(n_pixels, NODES)``; ``spread_um``: standard deviation
+    of the pixels that follow the surface [µm], ``(n_pixels,)``.
     """
     if len(chi2) == 0:
         return 1.0

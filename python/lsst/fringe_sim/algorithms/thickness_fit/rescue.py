@@ -48,10 +48,9 @@ def rescue_pixels(
 ) -> PixelFit:
     """Fit again the pixels whose chi-square is improbable.
 
-    ``pixels``: the fit so far; its arrays are revised in place, as a full sensor leaves no room for copies;
-    ``slip``: probability that the order of a pixel is wrong; raised in place where a pixel had to be looked for by
-    itself, float32; ``order_um``: thickness of one fringe order [µm]; ``range_um``: thicknesses that are possible
-    [µm]. Returns them with better values where there are; ``n_wavelengths`` is one less where one was left out.
+    ``pixels``: the fit so far; its arrays are revised in place, as a full sensor leaves no room for copies; ``slip``:
+    probability that the order of a pixel is wrong; raised in place where a pixel had to be looked for by itself,
+    float32. Returns them with better values where there are; ``n_wavelengths`` is one less where one was left out.
     """
     limit = typical_misfit(pixels) * chi2_limits(int(pixels.n_wavelengths.max(initial=0)))
     bad = np.empty(pixels.chi2.shape, np.bool_)

@@ -34,8 +34,7 @@ def doubt_from_shared_misfit(
     The misfit of one pixel in the direction of another order is then as good as that of all: an excess of ``d`` in
     the chi-square of a pixel at another order counts as ``d`` over the shared misfit per degree of freedom.
 
-    ``thickness_um``: thickness of every pixel [µm], float32, ``(ny, nx)``; ``order_um``: thickness of one fringe
-    order [µm].
+    ``thickness_um``: thickness of every pixel [µm], float32, ``(ny, nx)``.
     """
     apart = 1 + int(np.ceil(_APART * data.noise_correlation_px))
     ny, nx = thickness_um.shape

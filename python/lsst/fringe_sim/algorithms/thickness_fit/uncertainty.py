@@ -43,9 +43,8 @@ def lone_slip_probability(
 ) -> Float32Array:
     """Probability that the order of a pixel is wrong, on its own amplitudes alone.
 
-    ``thickness_um``: fitted thickness [µm], float32, ``(ny, nx)``; ``order_um``: thickness of one fringe order
-    [µm]. Returns it for a flat prior over four orders on both sides; 1 where there is no thickness, float32,
-    ``(ny, nx)``.
+    ``thickness_um``: fitted thickness [µm], float32, ``(ny, nx)``. Returns it for a flat prior over four orders on
+    both sides; 1 where there is no thickness, float32, ``(ny, nx)``.
     """
     out = np.ones(thickness_um.shape, np.float32)
     table = templates.table()

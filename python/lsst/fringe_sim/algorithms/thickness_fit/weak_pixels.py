@@ -31,9 +31,8 @@ def settle_weak_pixels(
 ) -> tuple[PixelFit, BoolArray]:
     """Give pixels that do not tell their thickness by themselves the surface of the cells as a prior.
 
-    ``pixels``: what the pixels found by themselves; its arrays are revised in place; ``order_um``: thickness of one
-    fringe order [µm]. Returns ``pixels``: the revised fit; ``leaning``: pixels that have a surface as their prior,
-    bool, ``(ny, nx)``.
+    ``pixels``: what the pixels found by themselves; its arrays are revised in place. Returns ``pixels``: the revised
+    fit; ``leaning``: pixels that have a surface as their prior, bool, ``(ny, nx)``.
     """
     typical = cells.weight[..., : templates.n_wavelengths].mean(axis=(0, 1))
     weak = _weak(templates, pixels, widest_parabola(templates, typical, order_um))
