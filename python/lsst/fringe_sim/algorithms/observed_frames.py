@@ -81,10 +81,10 @@ class CorrectedFrame:
         fitted = self.correction.frame
         good = fitted.fit.weight > 0
         step = max(1, min(self.frame.shape) // PICTURE_PX)
-        after, fringes = (_block_means(each, good, step) for each in (fitted.residual, self.fringes))
+        after, fringes = (_square_means(each, good, step) for each in (fitted.residual, self.fringes))
         before = after + fringes - self.fringes[good].mean(dtype=np.float64)
         correlation = self._correlation(good)
-        pictures = (before, _block_means(self.fringes, np.isfinite(self.fringes), step), after)
+        pictures = (before, _square_means(self.fringes, np.isfinite(self.fringes), step), after)
         found = self.correction
         return FrameRecord(
             name,
@@ -110,7 +110,7 @@ class CorrectedFrame:
         side = max(1, aperture // SQUARES_IN_APERTURE)
         fitted = self.correction.frame
         number = square_sums(good, side)
-        after, fringes = (_block_means(each, good, side) for each in (fitted.residual, self.fringes))
+        after, fringes = (_square_means(each, good, side) for each in (fitted.residual, self.fringes))
         before = after + fringes
         bins = LogBins(1.5, max(3.0, aperture / side), 8)
         found = [
@@ -369,7 +369,7 @@ def _at(values: FloatArray, number: int) -> float:
     return float(values[number]) if number < values.size else 0.0
 
 
-def _block_means(image: NDArray[Any], good: BoolArray, side: int) -> Float32Array:
+def _square_means(image: NDArray[Any], good: BoolArray, side: int) -> Float32Array:
     """Means over squares of the good pixels; NaN without any."""
     number = square_sums(good, side)
     total = masked_sums(image, good, side)

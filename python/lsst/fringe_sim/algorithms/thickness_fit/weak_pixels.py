@@ -53,8 +53,7 @@ def settle_weak_pixels(
     moved = local_variance(seen, np.where(local.holds, variance, 0.0) / step**2, widths, independence)
     width = np.sqrt(np.where(local.holds, variance + step**2 * moved, np.inf)).astype(np.float32)
     width = width[np.ix_(*cell_of)]
-    apart = _share_apart(data, templates, begin, width, order_um)
-    _settle_asked(data, templates, pixels, weak, begin, width, apart, order_um, threads)
+    _settle_asked(data, templates, pixels, weak, begin, width, order_um, threads)
     return pixels, weak & np.isfinite(width)
 
 
@@ -99,11 +98,11 @@ def _settle_asked(
     asked: BoolArray,
     surface: Float32Array,
     width: Float32Array,
-    apart: float,
     order_um: float,
     threads: int,
 ) -> None:
     """Posterior of some pixels, in place."""
+    apart = _share_apart(data, templates, surface, width, order_um)
     grid, away = templates.grid(), nodes_about(order_um / templates.step_um)
 
     def work(band: int) -> None:
