@@ -1,7 +1,5 @@
 """Cells that noise put on a phase of their own are found where their neighbours have them; steps stay."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What an error of light and contrast does to the thickness: to a pixel by itself, and to a surface through cells."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

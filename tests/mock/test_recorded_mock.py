@@ -3,8 +3,6 @@
 `test_mock_optics` compares its optics with other programs. What is drawn has no other truth than its statistics.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import datetime
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What no effect explains is learned, judged by other cells, and noise teaches nothing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """What effects promise before they are fitted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The search on one likelihood: what it finds, and what the part held out may not do."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 
