@@ -81,15 +81,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize(
     ("setup", "detector", "thickness_um", "effects"),
-    [
-        (
-            "lsst_e2v",
-            "R02_S12",
-            (14.9, 15.1),
-            {"contrast_loss.factor": 0.5},
-        ),
-        ("hsc", 0, (199.98, 200.02), {}),
-    ],
+    [("lsst_e2v", "R02_S12", (14.9, 15.1), {"contrast_loss.factor": 0.5}), ("hsc", 0, (199.98, 200.02), {})],
 )
 def test_light_of_the_sky(
     setup: str,

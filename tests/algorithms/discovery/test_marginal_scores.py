@@ -6,14 +6,7 @@ import numpy as np
 
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
 from lsst.fringe_sim.algorithms.discovery.marginal.scores import Scorer
-from lsst.fringe_sim.algorithms.inference import (
-    CellShape,
-    Data,
-    Forward,
-    Problem,
-    coordinates_of,
-    relaxed,
-)
+from lsst.fringe_sim.algorithms.inference import CellShape, Data, Forward, Problem, coordinates_of, relaxed
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.model import FringeModel
 
