@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lsst.fringe_sim.algorithms import fit_thickness
-from lsst.fringe_sim.algorithms.thickness_fit import FringeTemplates, walk_fit
+from lsst.fringe_sim.algorithms.thickness_fit import FlatTemplates, walk_fit
 from lsst.fringe_sim.algorithms.thickness_fit.fit import amplitudes_from_cube
 from lsst.fringe_sim.mock.thickness import e2v_321
 from lsst.fringe_sim.model import FringeModel
@@ -53,14 +53,14 @@ def full_sensor(model: FringeModel, truth: np.ndarray) -> FringeCube:
     )
 
 
-def paper_templates(model: FringeModel) -> FringeTemplates:
+def paper_templates(model: FringeModel) -> FlatTemplates:
     """Candidates of the paper: 30 000 thicknesses from 5 to 30 um."""
     step = (RANGE_UM[1] - RANGE_UM[0]) / THICKNESSES
     response = model.response_on_grid(WAVELENGTHS, RANGE_UM[0], step, THICKNESSES)
-    return FringeTemplates(np.ascontiguousarray(response.T), RANGE_UM[0], step, WAVELENGTHS)
+    return FlatTemplates(np.ascontiguousarray(response.T), RANGE_UM[0], step, WAVELENGTHS)
 
 
-def published_loop(cube: FringeCube, templates: FringeTemplates, first_um: float) -> tuple[float, float]:
+def published_loop(cube: FringeCube, templates: FlatTemplates, first_um: float) -> tuple[float, float]:
     """Wall and processor seconds per pixel of the walk as an interpreted loop over the candidates of a window."""
     amplitude = np.ascontiguousarray(templates.amplitude().T)
     half = round(0.5 * WINDOW_UM / templates.step_um)
@@ -77,7 +77,7 @@ def published_loop(cube: FringeCube, templates: FringeTemplates, first_um: float
     return wall / column.shape[1], cpu / column.shape[1]
 
 
-def compiled_walk(cube: FringeCube, templates: FringeTemplates) -> tuple[float, float]:
+def compiled_walk(cube: FringeCube, templates: FlatTemplates) -> tuple[float, float]:
     """Wall and processor seconds of one compiled walk over the sensor, the same candidates being asked."""
 
     def walk(part: FringeCube) -> None:

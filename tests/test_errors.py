@@ -7,13 +7,7 @@ import pickle
 import pytest
 
 from lsst.fringe_sim import errors
-from lsst.fringe_sim.errors import (
-    FringeSimError,
-    InputError,
-    OutOfRangeError,
-    UnknownNameError,
-    to_number,
-)
+from lsst.fringe_sim.errors import FringeSimError, InputError, OutOfRangeError, UnknownNameError, to_number
 
 
 def test_message_has_source_field_value_and_allowed() -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from lsst.fringe_sim.blocks import means_of_known
 from lsst.fringe_sim.style import (
     BAD_GREY,
-    block_mean,
     color_bar,
     draw_image,
     figure,
@@ -37,12 +37,12 @@ def test_blocks_are_means_of_what_is_known(block: int, rng: np.random.Generator)
     ny, nx = 11 // block * block, 17 // block * block
     cut = np.where(np.isfinite(values), values, np.nan)[:ny, :nx]
     if block == 1:
-        np.testing.assert_array_equal(block_mean(values, 1), values)
+        np.testing.assert_array_equal(means_of_known(values, 1), values)
         return
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         wanted = np.nanmean(cut.reshape(ny // block, block, nx // block, block), axis=(1, 3))
-    np.testing.assert_allclose(block_mean(values, block), wanted)
+    np.testing.assert_allclose(means_of_known(values, block), wanted)
 
 
 def test_range_of_colours() -> None:
@@ -90,7 +90,7 @@ def test_an_image_stands_in_pixels_of_the_sensor() -> None:
         assert made.get_size_inches().tolist() == [4.0, 3.0]
         assert drawn.get_extent() == [-0.5, 79.5, -0.5, 39.5]
         np.testing.assert_allclose(drawn.get_array(), values.reshape(5, 2, 10, 2).mean(axis=(1, 3)))
-        assert drawn.get_clim() == pytest.approx(finite_range(block_mean(values, 2)))
+        assert drawn.get_clim() == pytest.approx(finite_range(means_of_known(values, 2)))
         assert drawn.origin == "lower"
         assert drawn.get_interpolation() == "nearest"
         assert (axes.get_title(), axes.get_xlabel(), axes.get_ylabel()) == (

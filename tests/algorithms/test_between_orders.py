@@ -1,11 +1,9 @@
 """Cells that noise put on a phase of their own are found where their neighbours have them; steps stay."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.algorithms.thickness_fit import FringeTemplates
+from lsst.fringe_sim.algorithms.thickness_fit import FlatTemplates
 from lsst.fringe_sim.algorithms.thickness_fit.between_orders import Rises, join_neighbours
 from lsst.fringe_sim.algorithms.thickness_fit.cells import Cells
 from lsst.fringe_sim.algorithms.thickness_fit.misfit import Misfit
@@ -18,7 +16,7 @@ def joined(truth: np.ndarray, start: np.ndarray, noise: float, rng: np.random.Ge
     """Cells with fringes at three wavelengths that turn at different rates, asked from a start."""
     grid = 10.0 + 0.001 * np.arange(8000)
     phase = 2.0 * np.pi * np.outer(grid, [1.05, 1.0, 0.95]) / ORDER_UM
-    templates = FringeTemplates(1.0 + 0.1 * np.cos(phase), 10.0, 0.001, np.array([890.0, 930.0, 975.0]))
+    templates = FlatTemplates(1.0 + 0.1 * np.cos(phase), 10.0, 0.001, np.array([890.0, 930.0, 975.0]))
     edges = 8 * np.arange(len(truth) + 1)
     value, weight = (np.zeros((*truth.shape, 8), np.float32) for _ in range(2))
     amplitude = templates.amplitude_at(truth.ravel()).T.reshape(*truth.shape, 3)

@@ -1,7 +1,5 @@
 """Cells that maps are fitted to on the sky, and what of their misfit is noise, against sums over single pixels."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

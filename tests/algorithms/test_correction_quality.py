@@ -1,7 +1,5 @@
 """Measures of structure in a frame, where the answer is known."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Parts of a frame without noise count as pixels without a number."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames with the beam of every pixel, against models that trace that beam themselves."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -158,11 +158,7 @@ def test_bad_requests(model, rng) -> None:
     with pytest.raises(InputError):
         fit_thickness(cube, model, method="guo2022", start_pixel=(500, 3))
     nothing = FringeCube(
-        cube.image,
-        cube.variance,
-        np.full(cube.shape, mask_bits("BAD"), np.int16),
-        cube.exposures,
-        "relative",
+        cube.image, cube.variance, np.full(cube.shape, mask_bits("BAD"), np.int16), cube.exposures, "relative"
     )
     with pytest.raises(InputError):
         fit_thickness(nothing, model)

@@ -1,7 +1,5 @@
 """Flats that tell nothing, or hardly anything, of the thickness."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

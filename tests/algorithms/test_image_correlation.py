@@ -122,9 +122,7 @@ def test_coadds_of_2600_exposures_of_nine_sensors(rng):
     assert fringed.single.xi[0] == pytest.approx(1.4e-3**2, rel=0.3)
     scatter = noise**2 / 2600 / np.sqrt(fringed.null[-1].weight)
     np.testing.assert_allclose(
-        fringed.model[-1],
-        fringed.single.xi / 2600 + (1.0 - 1.0 / 2600) * fringed.floor.xi,
-        rtol=1e-12,
+        fringed.model[-1], fringed.single.xi / 2600 + (1.0 - 1.0 / 2600) * fringed.floor.xi, rtol=1e-12
     )
     assert np.all(np.abs(fringed.null[-1].xi) < 5 * scatter + noise**2 / 2600 / 64**2)
     assert np.all(np.abs(fringed.coadd[-1].xi - fringed.null[-1].xi - fringed.model[-1]) < 8 * scatter)

@@ -1,7 +1,5 @@
 """Flats that are not as the model has them, from another simulator: right by default, or said not to be."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,13 +1,11 @@
 """What an error of light and contrast does to the thickness: to a pixel by itself, and to a surface through cells."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.algorithms.thickness_fit import FringeTemplates, Nuisances
+from lsst.fringe_sim.algorithms.thickness_fit import FlatTemplates, Nuisances
 from lsst.fringe_sim.algorithms.thickness_fit.cells import Cells
 from lsst.fringe_sim.algorithms.thickness_fit.evidence import refine_row
 from lsst.fringe_sim.algorithms.thickness_fit.learned_error import learned_sigma
@@ -22,11 +20,11 @@ FREE = Nuisances(contrast="common")
 
 
 @pytest.fixture(scope="module")
-def templates() -> FringeTemplates:
+def templates() -> FlatTemplates:
     """Fringes of one order for 930 nm, over 4 µm."""
     grid = 13.0 + STEP_UM * np.arange(4000)
     fringes = 0.2 * np.cos(2.0 * np.pi * np.outer(grid, 930.0 / WAVELENGTHS) / ORDER_UM)
-    return FringeTemplates(1.0 + fringes, grid[0], STEP_UM, WAVELENGTHS, mean_response=np.ones(3))
+    return FlatTemplates(1.0 + fringes, grid[0], STEP_UM, WAVELENGTHS, mean_response=np.ones(3))
 
 
 def padded(values: np.ndarray) -> np.ndarray:
@@ -36,7 +34,7 @@ def padded(values: np.ndarray) -> np.ndarray:
     return out
 
 
-def learned(templates: FringeTemplates, sigma: float) -> NuisanceFit:
+def learned(templates: FlatTemplates, sigma: float) -> NuisanceFit:
     """Everything as the model has it, the contrast known to ``sigma``."""
     known = replace(NuisanceFit.none(3), mean_response=templates.mean_response, middle_um=15.0)
     return replace(known, covariance=np.array([[sigma**2]]))

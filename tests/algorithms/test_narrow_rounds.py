@@ -1,7 +1,5 @@
 """Rounds of mean response and orders of a narrow sensor, with solutions that are made up."""
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 import numpy as np

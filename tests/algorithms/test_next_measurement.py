@@ -191,10 +191,7 @@ PUBLISHED = [
     ("effects", "now", "added", "after"), PUBLISHED, ids=[" ~ ".join(case[0]) for case in PUBLISHED]
 )
 def test_published_likenesses(
-    effects: dict[str, dict[str, float]],
-    now: float,
-    added: FlatMeasurement | None,
-    after: float | None,
+    effects: dict[str, dict[str, float]], now: float, added: FlatMeasurement | None, after: float | None
 ) -> None:
     """Cosines of shared/discovery.md, section 3, "Numbers": a prototype with samples and sizes of its own.
 

@@ -1,7 +1,5 @@
 """Wide fringes that no template has yet are no objects, and objects among them are."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

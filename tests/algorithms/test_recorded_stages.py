@@ -1,7 +1,5 @@
 """Whole stages on small inputs, as recorded; other tests, most of them slow, say whether their results are right."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

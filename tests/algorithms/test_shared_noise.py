@@ -1,7 +1,5 @@
 """How many independent pixels smoothed noise has, from the correlation of all pairs of pixels."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

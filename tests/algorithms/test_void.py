@@ -1,7 +1,5 @@
 """A void in the adhesive, in every stage: flats, search, thickness, sky; against the mock's own optics."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -7,7 +7,7 @@ import pytest
 from laboratory_flats import ROWS, judge, make_flats
 
 from lsst.fringe_sim.algorithms import fit_thickness
-from lsst.fringe_sim.algorithms.thickness_fit import FringeTemplates
+from lsst.fringe_sim.algorithms.thickness_fit import FlatTemplates
 from lsst.fringe_sim.algorithms.thickness_fit.cells import Cells
 from lsst.fringe_sim.algorithms.thickness_fit.leaning import Leanings, local_variance
 from lsst.fringe_sim.algorithms.thickness_fit.local_surface import local_surface
@@ -111,7 +111,7 @@ def test_cells_beyond_a_crest_come_back(rng) -> None:
     grid = 14.0 + step * np.arange(1500)
     wavelength = np.array([930.0, 931.0, 932.0])
     fringes = 0.1 * np.cos(2.0 * np.pi * np.outer(grid, 930.0 / wavelength) / order)
-    templates = FringeTemplates(1.0 + fringes, grid[0], step, wavelength)
+    templates = FlatTemplates(1.0 + fringes, grid[0], step, wavelength)
     y, x = np.indices((16, 16))
     truth = 14.6 + 0.02 * (x - 7.5) + 0.004 * y
     crest = order * np.rint(truth / order)
@@ -141,11 +141,11 @@ def test_cells_beyond_a_crest_come_back(rng) -> None:
     assert 0.5 < np.sqrt(np.mean(pull**2)) < 1.5
 
 
-def cells_of(truth: np.ndarray, noise: float, rng: np.random.Generator) -> tuple[Cells, FringeTemplates]:
+def cells_of(truth: np.ndarray, noise: float, rng: np.random.Generator) -> tuple[Cells, FlatTemplates]:
     """Cells of 8 by 8 pixels with fringes at three wavelengths that never have their crests together."""
     grid = 14.0 + 0.001 * np.arange(1500)
     phase = 2.0 * np.pi * grid[:, None] / ORDER_UM + np.array([0.0, 2.0, 4.0])
-    templates = FringeTemplates(1.0 + 0.1 * np.cos(phase), 14.0, 0.001, np.array([930.0, 931.0, 932.0]))
+    templates = FlatTemplates(1.0 + 0.1 * np.cos(phase), 14.0, 0.001, np.array([930.0, 931.0, 932.0]))
     edges = 8 * np.arange(len(truth) + 1)
     value, weight = (np.zeros((*truth.shape, 8), np.float32) for _ in range(2))
     amplitude = templates.amplitude_at(truth.ravel()).T.reshape(*truth.shape, 3)

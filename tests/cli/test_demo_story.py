@@ -1,7 +1,5 @@
 """The demo step by step, with its programs replaced by results made by hand; `test_demo` runs the real ones."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

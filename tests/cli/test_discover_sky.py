@@ -21,16 +21,7 @@ def sky(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     thickness = folder / "thickness.fits"
     fits.PrimaryHDU(layer).writeto(thickness)
     out = folder / "night"
-    given = [
-        "sky",
-        "--setup",
-        "monocam",
-        "--thickness",
-        str(thickness),
-        "--night",
-        "--out",
-        str(out),
-    ]
+    given = ["sky", "--setup", "monocam", "--thickness", str(thickness), "--night", "--out", str(out)]
     assert run(given) == 0
     return out, str(thickness)
 

@@ -1,7 +1,5 @@
 """``fringe-sim focal-plane`` and ``fringe-sim amplitudes``."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Observed frames and templates as they should not be: each is refused by its name, and the others are used."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

@@ -10,7 +10,7 @@ from astropy.table import Table
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.paper import published_numbers
 from lsst.fringe_sim.paper.optics import FIELDS, _light_path
-from lsst.fringe_sim.paper.section import Curve, Graph, Picture, Section
+from lsst.fringe_sim.paper.section import Curve, Graph, PaperSection, Picture
 from lsst.fringe_sim.report.paper_page import section_figures
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -106,7 +106,7 @@ def test_curves_are_taken_from_the_first_folder_that_has_some(tmp_path, monkeypa
 def test_logarithmic_graphs_leave_out_what_cannot_be_drawn() -> None:
     x = np.arange(4.0)
     faint = Curve(x, np.array([1.0, 1e-9, -1.0, 2.0]), "faint")
-    section = Section("s", "", {}, (Graph("g", "x [px]", "y [1]", (faint, faint), True, 1e-6),))
+    section = PaperSection("s", "", {}, (Graph("g", "x [px]", "y [1]", (faint, faint), True, 1e-6),))
     (made,) = section_figures(section)
     drawn = np.asarray(made.axes[0].lines[0].get_ydata(), dtype=float)
     assert np.array_equal(np.isnan(drawn), [False, True, True, False])
@@ -126,7 +126,7 @@ def test_light_path_ends_at_one_place_of_the_focal_plane() -> None:
 
 
 def test_pictures_of_a_thinned_sensor_have_its_pixels_on_their_axes() -> None:
-    section = Section("s", "", {}, (Picture("map", "µm", np.ones((50, 40)), step_px=4.0),))
+    section = PaperSection("s", "", {}, (Picture("map", "µm", np.ones((50, 40)), step_px=4.0),))
     (made,) = section_figures(section)
     assert made.axes[0].images[0].get_extent() == [-0.5, 159.5, -0.5, 199.5]
 

@@ -1,7 +1,5 @@
 """Whatever names a sensor of the other vendor is refused before work: its films are not those of the set-up."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -56,10 +56,7 @@ def test_nothing_but_effects_is_written_into_an_override(name: str) -> None:
     statements = ast.parse(text).body
     first, *rest = [ast.unparse(line) for line in statements]
     assert re.fullmatch(r"config\.written_effects = 'bandwidth\.fwhm roughness\.sigma [0-9a-f]{16}'", first)
-    assert rest == [
-        "config.effects['roughness.sigma'] = 1.0",
-        "config.effects['bandwidth.fwhm'] = 2.5",
-    ]
+    assert rest == ["config.effects['roughness.sigma'] = 1.0", "config.effects['bandwidth.fwhm'] = 2.5"]
 
 
 def test_a_name_with_an_umlaut_is_a_name(tmp_path: Path) -> None:

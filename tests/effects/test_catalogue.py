@@ -1,7 +1,5 @@
 """Effects of one's own: from a file, from a module, from an installed package."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.effects import (
-    EFFECTS,
-    BrighterFatter,
-    ImageGeometry,
-    activate_effects,
-    apply_to_image,
-)
+from lsst.fringe_sim.effects import EFFECTS, BrighterFatter, ImageGeometry, activate_effects, apply_to_image
 from lsst.fringe_sim.mock import HIDDEN_EFFECTS
 from lsst.fringe_sim.model import FringeModel
 

@@ -1,7 +1,5 @@
 """Electrons that gather with time, told from those that every exposure has."""
 
-from __future__ import annotations
-
 import math
 from contextlib import nullcontext
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Shapes of the line, lines of the lamp, and the gap, against laws and independent sums."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

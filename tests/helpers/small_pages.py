@@ -25,7 +25,7 @@ from lsst.fringe_sim.challenge.result import CaseResult, ChallengeResult
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.paper.published import published_numbers
 from lsst.fringe_sim.paper.reproduce import Reproduction
-from lsst.fringe_sim.paper.section import Section
+from lsst.fringe_sim.paper.section import PaperSection
 from lsst.fringe_sim.products import FringeCube, ThicknessMap
 from lsst.fringe_sim.report.correction_page import write_correction_report, write_templates_report
 from lsst.fringe_sim.report.discovery_page import discovery_page
@@ -118,7 +118,7 @@ def map_on_sky(folder: Path, origin: Origin) -> Path:
 def paper(folder: Path, origin: Origin) -> Path:
     number = next(iter(published_numbers().values()))
     finding = number.compare(2.0 * number.high, "")
-    made = Reproduction((Section("Section 1", "Text.", {}),), ((finding,),))
+    made = Reproduction((PaperSection("Section 1", "Text.", {}),), ((finding,),))
     return write_paper_page(made, folder / "paper.html", (), origin)
 
 

@@ -1,7 +1,5 @@
 """Skies, nights, levels and beams against their formulae, at places where no other test looks, and as recorded."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

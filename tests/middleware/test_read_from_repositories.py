@@ -1,7 +1,5 @@
 """What commands read from a repository: flats to be searched, products of the demo, provenance."""
 
-from __future__ import annotations
-
 import datetime
 import json
 from pathlib import Path

@@ -3,8 +3,6 @@
 `test_mock_optics` compares its optics with other programs. What is drawn has no other truth than its statistics.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import datetime
 from pathlib import Path
@@ -83,15 +81,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize(
     ("setup", "detector", "thickness_um", "effects"),
-    [
-        (
-            "lsst_e2v",
-            "R02_S12",
-            (14.9, 15.1),
-            {"contrast_loss.factor": 0.5},
-        ),
-        ("hsc", 0, (199.98, 200.02), {}),
-    ],
+    [("lsst_e2v", "R02_S12", (14.9, 15.1), {"contrast_loss.factor": 0.5}), ("hsc", 0, (199.98, 200.02), {})],
 )
 def test_light_of_the_sky(
     setup: str,

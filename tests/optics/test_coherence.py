@@ -9,12 +9,7 @@ import tmm
 import yaml
 
 from lsst.fringe_sim.errors import ConvergenceError, OutOfRangeError, StackError
-from lsst.fringe_sim.optics import (
-    Beam,
-    LayerStack,
-    layer_absorption,
-    reduce_to_phase,
-)
+from lsst.fringe_sim.optics import Beam, LayerStack, layer_absorption, reduce_to_phase
 from lsst.fringe_sim.optics.illumination import GaussianProfile, MonochromaticProfile
 from lsst.fringe_sim.optics.system import OpticalSystem
 

@@ -7,13 +7,7 @@ import pytest
 from scipy.integrate import quad
 
 from lsst.fringe_sim.errors import InputError, OutOfRangeError
-from lsst.fringe_sim.optics import (
-    Beam,
-    Illumination,
-    LampSpectrum,
-    LayerStack,
-    SpectralProfile,
-)
+from lsst.fringe_sim.optics import Beam, Illumination, LampSpectrum, LayerStack, SpectralProfile
 from lsst.fringe_sim.optics.illumination import (
     SIGMA_PER_FWHM,
     GaussianProfile,
@@ -22,11 +16,7 @@ from lsst.fringe_sim.optics.illumination import (
 )
 from lsst.fringe_sim.optics.system import OpticalSystem
 
-PROFILES = [
-    MonochromaticProfile(),
-    GaussianProfile(2.0),
-    TriangularProfile(2.0),
-]
+PROFILES = [MonochromaticProfile(), GaussianProfile(2.0), TriangularProfile(2.0)]
 
 
 def system(profile: SpectralProfile, beam: Beam | None = None, temperature: float = 183.0) -> OpticalSystem:

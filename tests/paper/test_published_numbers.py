@@ -71,12 +71,7 @@ def test_where_the_paper_gives_no_number_only_the_correction_counts() -> None:
 
 @pytest.mark.parametrize(
     "changes",
-    [
-        {"published": None},
-        {"published": [2, 1]},
-        {"corrected": 3},
-        {"tolerance": -1},
-    ],
+    [{"published": None}, {"published": [2, 1]}, {"corrected": 3}, {"tolerance": -1}],
     ids=["no number at all", "upside down", "correction without a reason", "negative tolerance"],
 )
 def test_bad_entries_are_refused(changes) -> None:
@@ -153,8 +148,7 @@ OF_CURVES = ("one_pixel", "flat_contrast", "row_3000", "raft", "bandwidth", "abs
 
 
 @pytest.mark.parametrize(
-    "compute",
-    [pytest.param(one, id=one.__name__) for one in SECTIONS if one.__name__ in OF_CURVES],
+    "compute", [pytest.param(one, id=one.__name__) for one in SECTIONS if one.__name__ in OF_CURVES]
 )
 def test_a_section_of_a_small_sensor_is_as_recorded(
     compute, without_curves: Context, recorded: Record

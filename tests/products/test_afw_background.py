@@ -1,7 +1,5 @@
 """Lists of backgrounds as afw writes them are drawn as afw draws them: means of bins, splines, parabolas beyond."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Keywords of maps, cubes and sky frames are used, checked or refused as `FILE_KEYWORDS` says."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar

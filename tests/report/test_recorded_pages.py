@@ -29,7 +29,7 @@ from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.paper.published import published_numbers
 from lsst.fringe_sim.paper.reproduce import Reproduction
-from lsst.fringe_sim.paper.section import Curve, Graph, Picture, Section
+from lsst.fringe_sim.paper.section import Curve, Graph, PaperSection, Picture
 from lsst.fringe_sim.products import FlatFit, FringeCube, FringeFrame, SensorSection, SkyFringe, ThicknessMap
 from lsst.fringe_sim.report import figures
 from lsst.fringe_sim.report.correction_page import write_correction_report, write_templates_report
@@ -181,9 +181,9 @@ def paper_page(folder: Path) -> Path:
     )
     picture = Picture("p", "q", waves(9, 7), True, 3.0)
     sections = (
-        Section("First: one", "Text.", {}, (*graphs, picture), "Caption."),
-        Section("Second", "Text.", {}, (picture,) * 9, "Many."),
-        Section("Third", "Text.", {}),
+        PaperSection("First: one", "Text.", {}, (*graphs, picture), "Caption."),
+        PaperSection("Second", "Text.", {}, (picture,) * 9, "Many."),
+        PaperSection("Third", "Text.", {}),
     )
     made = Reproduction(sections, (tuple(findings[:2]), tuple(findings[2:]), ()))
     return write_paper_page(made, folder / "paper.html", ["a notice"])

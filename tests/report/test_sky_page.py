@@ -9,10 +9,10 @@ from browser import check_page
 
 from lsst.fringe_sim.algorithms.coadd_sources import NightResults
 from lsst.fringe_sim.algorithms.fringe_amplitudes import fringe_amplitudes
+from lsst.fringe_sim.blocks import means_of_known
 from lsst.fringe_sim.products import SkyFringe
 from lsst.fringe_sim.report.figures import residuals_figure
 from lsst.fringe_sim.report.sky_page import sky_amplitudes, write_sky_report
-from lsst.fringe_sim.style import block_mean
 
 
 def night(shape: tuple[int, int] = (150, 160), hours: int = 3) -> list[SkyFringe]:
@@ -61,7 +61,7 @@ def test_page_of_a_night_in_a_browser(tmp_path) -> None:
 def test_residuals_are_averaged_without_the_masked(tmp_path) -> None:
     plane = np.full((4, 6), 2.0)
     plane[0, 0], plane[2:, 4:] = np.nan, np.nan
-    assert np.array_equal(block_mean(plane, 2), [[2, 2, 2], [2, 2, np.nan]], equal_nan=True)
+    assert np.array_equal(means_of_known(plane, 2), [[2, 2, 2], [2, 2, np.nan]], equal_nan=True)
     left = np.random.default_rng(0).normal(0, 0.01, (3, 220, 240)).astype(np.float32)
     left[:, :, 100:120] = np.nan
     made = residuals_figure(left, [880.0, 930.0, 980.0])

@@ -12,13 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from lsst.pipe.base import (
-    Pipeline,
-    PipelineGraph,
-    PipelineTask,
-    PipelineTaskConfig,
-    PipelineTaskConnections,
-)
+from lsst.pipe.base import Pipeline, PipelineGraph, PipelineTask, PipelineTaskConfig, PipelineTaskConnections
 from lsst.pipe.base.connectionTypes import Input, Output
 
 SNIPPET = Path(__file__).parents[2] / "doc" / "guide" / "drp_fringes.yaml"

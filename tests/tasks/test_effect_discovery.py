@@ -52,10 +52,7 @@ def hidden(tmp_path_factory: pytest.TempPathFactory) -> dict[str, MockRun]:
 
 @pytest.fixture(scope="module")
 def searched(
-    command: Command,
-    empty_repo: Path,
-    hidden: dict[str, MockRun],
-    tmp_path_factory: pytest.TempPathFactory,
+    command: Command, empty_repo: Path, hidden: dict[str, MockRun], tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     """Repository after the search in both sensors."""
     repo = Path(shutil.copytree(empty_repo, tmp_path_factory.mktemp("discovery") / "repo"))

@@ -1,7 +1,5 @@
 """What tasks make of small inputs, and the numbers that they report, as recorded."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from types import SimpleNamespace

@@ -10,9 +10,7 @@ from .lazy import homes, on_first_use
 
 __version__ = "1.0.0"
 
-_LAZY = homes(
-    middleware="LsstCamFringe Ts8Fringe MonoCamFringe HscFringe",
-)
+_LAZY = homes(middleware="LsstCamFringe Ts8Fringe MonoCamFringe HscFringe")
 
 __all__ = ["__version__", *sorted(_LAZY)]
 __getattr__ = on_first_use(__name__, _LAZY)

@@ -6,6 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
-FloatImage = NDArray[np.float32]
+Float32Array = NDArray[np.float32]
 ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import zlib
 from collections.abc import Iterator
@@ -21,6 +20,9 @@ from matplotlib.image import AxesImage
 from mpl_toolkits.axes_grid1 import make_axes_locatable
 from numpy.typing import NDArray
 from PIL import Image
+
+from .array_types import FloatArray
+from .blocks import means_of_known
 
 SEQUENTIAL = "cividis"
 DIVERGING = "PuOr_r"
@@ -216,23 +218,6 @@ def map_to_png(
     return pixels_to_png(numbers[::-1], np.rint(255.0 * palette).astype(np.uint8))
 
 
-def _thin(values: NDArray[np.float64], most_px: int) -> NDArray[np.float64]:
+def _thin(values: FloatArray, most_px: int) -> FloatArray:
     """Mean over square blocks, so that fringes do not alias when a large image is drawn small."""
-    return block_mean(values, max(1, min(values.shape) // most_px))
-
-
-def block_mean(values: NDArray[np.float64], block: int) -> NDArray[np.float64]:
-    """Mean over square blocks of pixels that are numbers; rows and columns that fill no block are left out."""
-    if block == 1:
-        return values
-    ny, nx = (size // block * block for size in values.shape)
-    values = values[:ny, :nx]
-    known = np.isfinite(values)
-
-    def summed(plane: NDArray[Any]) -> NDArray[Any]:  # a few long sums take less time than many short ones
-        rows = functools.reduce(np.add, (plane[k::block] for k in range(block)))
-        columns: NDArray[Any] = functools.reduce(np.add, (rows[:, k::block] for k in range(block)))
-        return columns
-
-    total, count = summed(np.where(known, values, 0.0)), summed(known.astype(np.int32))
-    return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+    return means_of_known(values, max(1, min(values.shape) // most_px))

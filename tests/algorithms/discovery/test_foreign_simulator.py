@@ -1,7 +1,5 @@
 """The search on flats of a simulator that shares nothing with the model but the tables of the media."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What no effect explains is learned, judged by other cells, and noise teaches nothing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,11 +16,7 @@ from lsst.fringe_sim.algorithms.discovery.fit import (
     fit_model,
 )
 from lsst.fringe_sim.algorithms.discovery.learned_columns import LocalColumns
-from lsst.fringe_sim.algorithms.discovery.learning import (
-    Learned,
-    Prior,
-    judging_cells,
-)
+from lsst.fringe_sim.algorithms.discovery.learning import Learned, Prior, judging_cells
 from lsst.fringe_sim.algorithms.discovery.lesson import evidence_of_correction, learned_beside
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare
 from lsst.fringe_sim.algorithms.discovery.skeleton import effect_skeleton

@@ -1,7 +1,5 @@
 """One effect in the place of two, and two in the place of one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast

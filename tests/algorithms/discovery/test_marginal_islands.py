@@ -1,7 +1,5 @@
 """Local effects in the search on one likelihood: several of them, and such as look like a step of the thickness."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import cast
 

@@ -1,7 +1,5 @@
 """What the search on one likelihood forecasts of further flats, and what it lets a correction be learned from."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,21 +1,12 @@
 """What effects promise before they are fitted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
 from lsst.fringe_sim.algorithms.discovery.marginal.scores import Scorer
-from lsst.fringe_sim.algorithms.inference import (
-    CellShape,
-    Data,
-    Forward,
-    Problem,
-    coordinates_of,
-    relaxed,
-)
+from lsst.fringe_sim.algorithms.inference import CellShape, Data, Forward, Problem, coordinates_of, relaxed
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.model import FringeModel
 

@@ -1,7 +1,5 @@
 """The search on one likelihood: what it finds, and what the part held out may not do."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -60,13 +58,7 @@ def test_nothing_is_found_where_nothing_is(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "draw",
-    [
-        "marginal single ",
-        *"abc",
-    ],
-)
+@pytest.mark.parametrize("draw", ["marginal single ", *"abc"])
 def test_an_effect_is_named(draw: str) -> None:
     rng = np.random.default_rng(list(draw.encode()))
     verdict = verdict_of(cube_of(rng, {"wavelength_offset.offset": 1.5}))

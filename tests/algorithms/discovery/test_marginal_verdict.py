@@ -1,7 +1,5 @@
 """What the search on one likelihood concludes: held-out data, a stand-in, the accuracy of the model, what is left."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sums over pixels, priors, and curves through errors, against calculations of each entry."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """Records of whole searches, for edits that are not meant to change them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Single stages on one small sensor: sets of effects, pairs, and neighbouring minima."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

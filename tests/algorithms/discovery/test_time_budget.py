@@ -1,7 +1,5 @@
 """A search that is given a time says what it knows when the time is over, and that it did not end."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

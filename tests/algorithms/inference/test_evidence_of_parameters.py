@@ -1,7 +1,5 @@
 """What parameters add to the log likelihood of a fit, against integrals over their priors that are done otherwise."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.integrate import quad

@@ -1,7 +1,5 @@
 """The log marginal likelihood against a dense calculation, against pixels, and its gradient against differences."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

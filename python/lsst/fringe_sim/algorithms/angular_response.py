@@ -27,8 +27,7 @@ from .sky_response import (
     white_light,
 )
 
-ANGLES = 192
-"""Nodes in sin²θ for lines: 3e-5 of the peak-to-peak of an LSST sky frame at any radius (128 give 2e-3)."""
+ANGLES = 192  # Nodes in sin²θ for lines: 3e-5 of the peak-to-peak of an LSST sky frame at any radius (128 give 2e-3)
 
 CONTINUUM_ANGLES = 128
 """The same for continua, whose fringes average out over wavelength: 2e-4 of the peak-to-peak where fringes are

@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 from astropy.table import Table
-from numpy.typing import NDArray
 from scipy.ndimage import affine_transform
 
-from ..array_types import FloatArray
+from ..array_types import Float32Array, FloatArray
 from ..errors import named_units
 from ..products import FringeComponents, SkyFringe
 from .coadds import Coadds, VisitPlaces, coadds_of_frames, filled_pattern, patterns_left, placed_visits
@@ -94,7 +93,7 @@ def _departures(
 
 
 def _coadds(
-    patterns: Sequence[NDArray[np.float32]], places: VisitPlaces, region_px: int
+    patterns: Sequence[Float32Array], places: VisitPlaces, region_px: int
 ) -> Iterator[tuple[int, list[dict[str, FloatArray]]]]:
     """Number of visits, and fringes in the region before and after the correction: visits, then the coadd of all."""
     mixing = {FRINGES: np.eye(len(patterns))}
@@ -113,7 +112,7 @@ def _coadds(
 
 
 def _pieces(
-    patterns: Sequence[NDArray[np.float32]],
+    patterns: Sequence[Float32Array],
     mixing: dict[str, FloatArray],
     places: VisitPlaces,
     number: int,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import affine_transform, spline_filter
 
-from ..array_types import FloatArray
+from ..array_types import Float32Array, FloatArray
 from ..errors import InputError, OutOfRangeError, named_units
 from ..products import SkyFringe
 from ..resources import read_user_table
@@ -221,7 +221,7 @@ def _square_variance(image: FloatArray, sides: NDArray[np.int64]) -> FloatArray:
     return np.array([(each / side**2).var() for each, side in zip(sums, sides, strict=True)])
 
 
-def filled_pattern(frame: SkyFringe) -> NDArray[np.float32]:
+def filled_pattern(frame: SkyFringe) -> Float32Array:
     """Pattern with the mean sky where it is not known."""
     values = frame.fraction()
     return np.where((frame.mask == 0) & np.isfinite(values), values, np.float32(0))

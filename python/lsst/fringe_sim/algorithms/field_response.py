@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..array_types import FloatArray
+from ..array_types import Float32Array, FloatArray
 from ..compiled import contiguous, kernel, run_shares
 from ..errors import InputError, OutOfRangeError
 from ..instrument.beam_field import BeamField
@@ -179,7 +179,7 @@ class FieldTable:
         """Largest error of the interpolation in thickness."""
         return self.table.interpolation_error
 
-    def frame(self, thickness_um: ArrayLike) -> NDArray[np.float32]:
+    def frame(self, thickness_um: ArrayLike) -> Float32Array:
         """Image of the sensor.
 
         ``thickness_um`` (ny, nx): thickness on pixels of any size that cover the sensor; NaN gives NaN.

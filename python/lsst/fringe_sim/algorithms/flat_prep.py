@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_propagation
 
+from ..array_types import Float32Array
 from ..errors import FrameFormatError, InputError, named_units
 from ..instrument.camera import Detector
 from ..instrument.raw_frame import RawFrame
@@ -39,7 +40,7 @@ __all__ = [
     "smooth_masked",
 ]
 
-Image = NDArray[np.float32]
+Image = Float32Array
 Mask = NDArray[np.int32]
 
 ADC_MAXIMUM = 2**18 - 1  # Largest number of the 18-bit converters [ADU]; a pixel there has lost its value

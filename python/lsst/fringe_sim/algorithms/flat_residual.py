@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import FloatArray
+from ..array_types import Float32Array, FloatArray
 from ..effects import ImageGeometry, apply_to_image
 from ..errors import InputError, named_units
 from ..model import FringeModel
@@ -44,7 +44,7 @@ class FlatResidual:
     """
 
     wavelength_nm: FloatArray
-    residual: NDArray[np.float32]
+    residual: Float32Array
     thickness: ThicknessMap
 
     @property
@@ -101,7 +101,7 @@ def flat_residual(
     model: FringeModel,
     thickness_um: NDArray[np.floating],
     contrast: FloatArray | None = None,
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Flats minus model at a given thickness, each plane over its mean.
 
     Parameters

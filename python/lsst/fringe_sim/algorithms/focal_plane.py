@@ -17,6 +17,7 @@ from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
 from ..array_types import FloatArray
+from ..blocks import block_means
 from ..errors import InputError, OutOfRangeError
 from ..instrument.bandpass import Bandpass
 from ..instrument.detector import Detector
@@ -252,13 +253,13 @@ def pattern_moments(
     for table in response.component_tables():
         frame = table.frame(thickness)
         total += frame
-        patterns.append(_block_means(frame, block))
+        patterns.append(block_means(frame, block))
     stack = np.stack(patterns)
     known = np.isfinite(stack[0])
     means = stack[:, known].mean(axis=1, dtype=np.float64)
     stack = (stack - means[:, None, None]) / means.sum()  # now in double precision
     products = [
-        _cell_products(_block_means(stack, round(side / _BLOCK_ARCSEC)), chosen.cells)
+        _cell_products(block_means(stack, round(side / _BLOCK_ARCSEC)), chosen.cells)
         for side in chosen.apertures_arcsec
     ]
     amplitudes = fringe_amplitudes(total, ~np.isfinite(thickness))
@@ -378,15 +379,6 @@ def _block_of(shape: tuple[int, ...], response: SensorResponse, options: Forecas
             f"pixels of at most 1 arcsec, {least} of them on a side for {options.cells} cells",
         )
     return block
-
-
-def _block_means(images: NDArray[Any], side: int) -> NDArray[Any]:
-    """Means over squares of the last two axes, incomplete squares left out; NaN where any pixel is NaN."""
-    if side == 1:
-        return images
-    rows, columns = (size // side for size in images.shape[-2:])
-    cut = images[..., : rows * side, : columns * side]
-    return np.asarray(cut.reshape(*images.shape[:-2], rows, side, columns, side).mean(axis=(-3, -1)))
 
 
 def _cell_products(patterns: NDArray[Any], cells: int) -> FloatArray:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 from threadpoolctl import threadpool_limits
 
-from ..array_types import BoolArray, FloatArray
+from ..array_types import BoolArray, Float32Array, FloatArray
 from ..errors import InputError
 from ..products import SkyFringe
 
@@ -77,7 +77,7 @@ class FrameStack:
         """Good pixels."""
         return int(np.count_nonzero(self.good))
 
-    def gram_and_mean(self) -> tuple[FloatArray, NDArray[np.float32]]:
+    def gram_and_mean(self) -> tuple[FloatArray, Float32Array]:
         """Gram matrix of the frames less their mean over frames, and that mean frame; 0 where there is none."""
         count = len(self.frames)
         whole = np.zeros((count, count))
@@ -98,7 +98,7 @@ class FrameStack:
         whole -= whole.mean(axis=1)[:, None]
         return 0.5 * (whole + whole.T) / self.unit**2, mean
 
-    def components(self, combination: FloatArray) -> tuple[NDArray[np.float32], FloatArray]:
+    def components(self, combination: FloatArray) -> tuple[Float32Array, FloatArray]:
         """Components ``combination.T @ (frames - mean)`` and the signs that were given to them.
 
         The largest entry of every component is made positive. Sums are made in the precision of the frames, after

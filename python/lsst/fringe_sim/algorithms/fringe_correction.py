@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..array_types import BoolArray, FloatArray
+from ..array_types import BoolArray, Float32Array, FloatArray
 from ..compiled import run_threaded
 from ..errors import InputError, OutOfRangeError, named_units, to_number
 from ..products import CORRECTED, FringeFrame, refuse_corrected
@@ -79,8 +79,8 @@ class TemplateSet:
         Header keywords of each, as far as they have some.
     """
 
-    patterns: list[NDArray[np.float32]]
-    variances: list[NDArray[np.float32]]
+    patterns: list[Float32Array]
+    variances: list[Float32Array]
     unknown: BoolArray
     identity: str
     metadata: list[Mapping[str, Any]] = field(default_factory=list)
@@ -309,7 +309,7 @@ def _stated_scales(header: Mapping[str, Any], patterns: Sequence[NDArray[Any]]) 
 
 
 @named_units
-def component_patterns(thickness_um: ArrayLike, response: SkyResponse) -> NDArray[np.float32]:
+def component_patterns(thickness_um: ArrayLike, response: SkyResponse) -> Float32Array:
     """Fringe pattern of every component of the sky: the physical alternative to components found in frames.
 
     Their span holds the fringes of every night exactly; but they resemble each other, and the scales of so many
@@ -344,7 +344,7 @@ def component_patterns(thickness_um: ArrayLike, response: SkyResponse) -> NDArra
     return patterns
 
 
-def _pattern(template: FringeFrame | ArrayLike) -> tuple[NDArray[np.float32], BoolArray]:
+def _pattern(template: FringeFrame | ArrayLike) -> tuple[Float32Array, BoolArray]:
     """A template, and where it has no value."""
     if isinstance(template, FringeFrame):
         return template.image, template.mask != 0

@@ -15,6 +15,7 @@ import numpy as np
 from galsim.config.image_scattered import ScatteredImageBuilder
 from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..errors import InputError
 from ..instrument.detector import Detector
 from ..instrument.sky import SkySpectrum
@@ -96,7 +97,7 @@ def _pattern(config: dict[str, Any], base: dict[str, Any], shape: tuple[int, int
 @functools.lru_cache(maxsize=4)
 def _sensor(
     detector: str, setup: str, thickness: str, airmass: float | None, effects: tuple[tuple[str, float], ...]
-) -> tuple[NDArray[np.float64], FringeModel, Response]:
+) -> tuple[FloatArray, FringeModel, Response]:
     """Thickness [µm], model and response of a sensor; kept for its next exposure."""
     chosen = Setup.from_name(setup)
     sensor = chosen.sensor(detector)
@@ -110,7 +111,7 @@ def _sensor(
     return layer, model, sensor_response(model, sky, placement, thickness_span_um(layer))
 
 
-def _layer(path: str, setup: Setup, sensor: Detector) -> tuple[NDArray[np.float64], dict[str, Any]]:
+def _layer(path: str, setup: Setup, sensor: Detector) -> tuple[FloatArray, dict[str, Any]]:
     """Thickness of the varying layer [µm], NaN where it is not known, and what its header says."""
     found = (
         ThicknessMap.read_any(path, setup.varying).of_setup(setup, path)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..array_types import Float32Array
 from ..compiled import run_threaded
 from ..errors import InputError, OutOfRangeError
 
@@ -16,7 +17,7 @@ _BAND_ROWS = 64
 
 def add_exposure_noise(
     electrons: ArrayLike, rng: np.random.Generator, read_noise_e: float = 0.0
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Poisson noise of the photoelectrons and Gaussian read noise [e⁻], exact up to 2²⁴ electrons.
 
     From ``rng`` one stream is spawned for every 64 rows.

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..array_types import FloatArray
+from ..array_types import Float32Array, FloatArray
 from ..effects import ActiveEffect, ImageGeometry
 from ..model import FringeModel
 
@@ -91,7 +91,7 @@ class IslandTable:
         tables = (self.outside, *(inside for _, inside in self.islands))
         return max(table.interpolation_error for table in tables)
 
-    def frame(self, thickness_um: ArrayLike) -> NDArray[np.float32]:
+    def frame(self, thickness_um: ArrayLike) -> Float32Array:
         """Frame of a thickness map [µm] that covers the sensor, shape ``(ny, nx)``."""
         thickness = np.asarray(thickness_um)
         image = self.outside.frame(thickness)

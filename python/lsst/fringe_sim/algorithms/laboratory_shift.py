@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..array_types import FloatArray, FloatImage
+from ..array_types import Float32Array, FloatArray
 from ..effects.at_telescope import ADHESIVE_PHASE_SIGMA, adhesive_change
 from ..errors import OutOfRangeError
 from ..model import FringeModel
@@ -39,7 +39,7 @@ def widened_um(model: FringeModel, span_um: tuple[float, float], sigma: float) -
 
 def phase_change(
     table: FrameTable, thickness_um: ArrayLike, model: FringeModel, sigma: float
-) -> FloatImage | None:
+) -> Float32Array | None:
     """Half the difference of the skies, each over its mean, with the adhesive at both ends of its uncertainty.
 
     ``sigma``: standard uncertainty of the phase [rad per 10 K]. Returns ``(ny, nx)``, NaN where the thickness is not
@@ -53,7 +53,7 @@ def phase_change(
     return np.asarray(0.5 * (longer - shorter), dtype=np.float32)
 
 
-def _over_mean(frame: FloatImage) -> FloatArray:
+def _over_mean(frame: Float32Array) -> FloatArray:
     """Frame in units of the mean of its known pixels."""
     return frame / frame.mean(dtype=np.float64, where=np.isfinite(frame))
 

@@ -302,11 +302,7 @@ def _followed(problem: RangeCells, start: FloatArray, used: BoolArray) -> Fitted
 
 
 def _widened(
-    problem: RangeCells,
-    covariance: FloatArray,
-    thickness: FloatArray,
-    used: BoolArray,
-    level: FloatArray,
+    problem: RangeCells, covariance: FloatArray, thickness: FloatArray, used: BoolArray, level: FloatArray
 ) -> FloatArray:
     """Covariance with what the residuals of parts have in common (Liang & Zeger 1986, Biometrika 73, 13)."""
     left = problem.value - _beside(problem, thickness) @ level

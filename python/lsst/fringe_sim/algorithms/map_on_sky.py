@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from ..array_types import FloatArray
+from ..array_types import Float32Array, FloatArray
+from ..blocks import block_sums
 from ..errors import InputError, named_units
 from ..notebook import do_nothing
 from ..products import ObservedFrame, ThicknessMap, mask_bits
@@ -68,10 +68,10 @@ def map_on_sky(
         value, weight = fringes_alone(frame(), patterns, chosen, known.shape)
         weight[~good] = 0.0
         values.append(_cell_means(value, weight, cell))
-        weights.append(_cell_sums(weight, cell))
+        weights.append(block_sums(weight, cell))
         advance()
     seen = good.astype(float)
-    layer = np.where(_cell_sums(seen, cell) > 0.0, _cell_means(known, seen, cell), np.nan)
+    layer = np.where(block_sums(seen, cell) > 0.0, _cell_means(known, seen, cell), np.nan)
     tables = [
         response.sky({name: float(name == band) for name in response.component}) for band in response.bands
     ]
@@ -95,7 +95,7 @@ def _cell_px(known: FloatArray, order_um: float) -> int:
     return cell
 
 
-def _pattern(dark: FrameTable, thickness_um: FloatArray) -> NDArray[np.float32]:
+def _pattern(dark: FrameTable, thickness_um: FloatArray) -> Float32Array:
     """The sky of a map, of mean 0: two that are a quarter of an order apart add up to that of any common shift."""
     good = np.isfinite(thickness_um)
     frame = dark.frame(thickness_um).astype(float)
@@ -103,10 +103,7 @@ def _pattern(dark: FrameTable, thickness_um: FloatArray) -> NDArray[np.float32]:
 
 
 def fringes_alone(
-    frame: ObservedFrame,
-    patterns: list[NDArray[np.float32]],
-    options: CorrectionOptions,
-    shape: tuple[int, ...],
+    frame: ObservedFrame, patterns: list[Float32Array], options: CorrectionOptions, shape: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray]:
     """A frame over its background, minus one, and its inverse variance, 0 in objects.
 
@@ -124,16 +121,9 @@ def fringes_alone(
     return value, np.where(used, weight * surface**2, 0.0)
 
 
-def _cell_sums(image: FloatArray, cell: int) -> FloatArray:
-    """Sums over cells; rows and columns that do not fill one are left out."""
-    rows, columns = (side // cell for side in image.shape)
-    cut = image[: rows * cell, : columns * cell]
-    return np.asarray(cut.reshape(rows, cell, columns, cell).sum(axis=(1, 3)))
-
-
 def _cell_means(image: FloatArray, weight: FloatArray, cell: int) -> FloatArray:
-    total = _cell_sums(weight, cell)
-    share = _cell_sums(np.where(weight > 0.0, image, 0.0) * weight, cell)
+    total = block_sums(weight, cell)
+    share = block_sums(np.where(weight > 0.0, image, 0.0) * weight, cell)
     return np.divide(share, total, out=np.zeros(total.shape), where=total > 0.0)
 
 

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
+from ..array_types import BoolArray, Float32Array, FloatArray
 from ..compiled import run_threaded
 from ..errors import InputError, OutOfRangeError
 
-Image = NDArray[np.float32]
+Image = Float32Array
 
 SMOOTHING_REACH = 4.0  # Half width of the smoothing kernel in standard deviations
 
@@ -21,9 +22,7 @@ MINIMUM_WEIGHT = 0.02
 _BAND_ROWS = 256  # Rows that one thread smooths at a time
 
 
-def smooth_masked(
-    image: Image, variance: Image, good: NDArray[np.bool_], sigma_px: float
-) -> tuple[Image, Image]:
+def smooth_masked(image: Image, variance: Image, good: BoolArray, sigma_px: float) -> tuple[Image, Image]:
     """Gaussian average over good pixels only, and its variance.
 
     With kernel ``G`` and weight ``w`` (1 on good pixels, else 0): ``Σ G w I / Σ G w``, variance
@@ -64,7 +63,7 @@ def smooth_masked(
         rows, inner = slice(first, stop + reach), slice(start - first, stop - first)
         near = usable[rows]
 
-        def spread(values: NDArray[np.floating], factors: NDArray[np.float64]) -> NDArray[np.float32]:
+        def spread(values: NDArray[np.floating], factors: FloatArray) -> Float32Array:
             masked = np.where(near, values, np.float32(0.0)).astype(np.float32, copy=False)
             columns = correlate1d(masked, factors, axis=0, mode="constant")[inner]
             return correlate1d(columns, factors, axis=1, mode="constant")
@@ -79,7 +78,7 @@ def smooth_masked(
     return value, noise
 
 
-def _gaussian_kernel(sigma_px: float) -> NDArray[np.float64]:
+def _gaussian_kernel(sigma_px: float) -> FloatArray:
     reach = max(1, math.ceil(SMOOTHING_REACH * sigma_px))
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
     return kernel / kernel.sum()

@@ -13,6 +13,7 @@ import numpy as np
 from astropy.table import Table, vstack
 from numpy.typing import NDArray
 
+from ..array_types import BoolArray, Float32Array, FloatArray
 from ..errors import InputError, named_units
 from ..notebook import do_nothing
 from ..products import FringeFrame, FringeTemplates, ObservedFrame, mask_bits, refuse_corrected
@@ -73,17 +74,17 @@ class CorrectedFrame:
     frame: ObservedFrame
     correction: FringeCorrection
     proof: FrameProof
-    fringes: NDArray[np.float32]
+    fringes: Float32Array
 
     def record(self, name: str, injected: Table | None = None) -> FrameRecord:
         """What is kept of a frame when its pixels are written."""
         fitted = self.correction.frame
         good = fitted.fit.weight > 0
         step = max(1, min(self.frame.shape) // PICTURE_PX)
-        after, fringes = (_block_means(each, good, step) for each in (fitted.residual, self.fringes))
+        after, fringes = (_square_means(each, good, step) for each in (fitted.residual, self.fringes))
         before = after + fringes - self.fringes[good].mean(dtype=np.float64)
         correlation = self._correlation(good)
-        pictures = (before, _block_means(self.fringes, np.isfinite(self.fringes), step), after)
+        pictures = (before, _square_means(self.fringes, np.isfinite(self.fringes), step), after)
         found = self.correction
         return FrameRecord(
             name,
@@ -100,7 +101,7 @@ class CorrectedFrame:
             sky_is_subtracted(float(np.median(fitted.background)), self._pixel_noise()),
         )
 
-    def _correlation(self, good: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def _correlation(self, good: BoolArray) -> FloatArray:
         """Separation [px] and correlation before and after, over the variance of a pixel, shape ``(3, B)``.
 
         Of means over squares, at separations beyond one square, where white noise has none.
@@ -109,7 +110,7 @@ class CorrectedFrame:
         side = max(1, aperture // SQUARES_IN_APERTURE)
         fitted = self.correction.frame
         number = square_sums(good, side)
-        after, fringes = (_block_means(each, good, side) for each in (fitted.residual, self.fringes))
+        after, fringes = (_square_means(each, good, side) for each in (fitted.residual, self.fringes))
         before = after + fringes
         bins = LogBins(1.5, max(3.0, aperture / side), 8)
         found = [
@@ -155,12 +156,12 @@ class FrameRecord:
 
     name: str
     detector: str
-    scale: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    scale: FloatArray
+    sigma: FloatArray
     proof: FrameProof
-    pictures: tuple[NDArray[np.float32], ...]
+    pictures: tuple[Float32Array, ...]
     step_px: int = 1
-    correlation: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 0)))
+    correlation: FloatArray = field(default_factory=lambda: np.zeros((3, 0)))
     injected: Table | None = None
     unit: str = ""
     of_own_templates: bool = False
@@ -325,7 +326,7 @@ def recover_sources(
         No place where a source would be alone.
     """
 
-    def both(image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def both(image: Float32Array) -> tuple[Float32Array, Float32Array]:
         done = correct_fringes(image, templates, variance=frame.variance, mask=frame.mask, options=options)
         background = done.frame.background
         return image - background, np.asarray(done.image, dtype=np.float32) - background
@@ -358,17 +359,17 @@ def injected_table(records: Sequence[FrameRecord]) -> Table | None:
     return vstack(tables) if tables else None
 
 
-def _largest(values: NDArray[np.float64]) -> float:
+def _largest(values: FloatArray) -> float:
     """The value that is farthest from 0; NaN without any."""
     known = values[np.isfinite(values)]
     return float(known[np.argmax(np.abs(known))]) if known.size else math.nan
 
 
-def _at(values: NDArray[np.float64], number: int) -> float:
+def _at(values: FloatArray, number: int) -> float:
     return float(values[number]) if number < values.size else 0.0
 
 
-def _block_means(image: NDArray[Any], good: NDArray[np.bool_], side: int) -> NDArray[np.float32]:
+def _square_means(image: NDArray[Any], good: BoolArray, side: int) -> Float32Array:
     """Means over squares of the good pixels; NaN without any."""
     number = square_sums(good, side)
     total = masked_sums(image, good, side)
@@ -384,7 +385,7 @@ def first_of_alike(
     """
     first = frames[0]()
 
-    def images() -> Iterator[NDArray[np.float32]]:
+    def images() -> Iterator[Float32Array]:
         for frame in frames:
             read = frame()
             _refuse_other(read, first)
@@ -393,12 +394,12 @@ def first_of_alike(
     return first, refuse_equal_pixels(purpose, images(), names)
 
 
-def _loaded(frame: Callable[[], ObservedFrame]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _loaded(frame: Callable[[], ObservedFrame]) -> tuple[Float32Array, Float32Array]:
     read = frame()
     return read.image, frame_weight(read)
 
 
-def frame_weight(frame: ObservedFrame) -> NDArray[np.float32]:
+def frame_weight(frame: ObservedFrame) -> Float32Array:
     """Inverse variance of the background of a frame, 0 where it is masked, no number, or has no noise."""
     good = without_constant_blocks(frame.image, (frame.mask == 0) & np.isfinite(frame.image))
     weight = steady_weight(good, frame.variance, frame.image)

@@ -6,15 +6,15 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import make_lsq_spline
 from scipy.ndimage import median_filter
 
+from ..array_types import Float32Array, FloatArray
 from ..errors import FrameFormatError
 from ..instrument.raw_frame import RawAmplifier
 from .flat_prep_options import DEFAULT_OPTIONS, GAUSSIAN_MAD, FlatPrepOptions
 
-Image = NDArray[np.float32]
+Image = Float32Array
 
 NEARBY_ROWS = 25  # Rows on either side among which the overscan of a row is judged; fewer may hold charge
 
@@ -110,7 +110,7 @@ def _running_median(level: Image) -> Image:
     return median_filter(padded, 2 * reach + 1)[reach : reach + len(level)]
 
 
-def _robust_spline(values: NDArray[np.float64], options: FlatPrepOptions) -> NDArray[np.float64]:
+def _robust_spline(values: FloatArray, options: FlatPrepOptions) -> FloatArray:
     """Cubic least-squares spline through equidistant values, refitted without outliers."""
     position = np.arange(len(values), dtype=float)
     intervals = min(options.overscan_knots, max(1, len(values) // 8))

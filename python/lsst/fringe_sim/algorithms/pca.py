@@ -17,7 +17,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
-from ..array_types import BoolArray, FloatArray
+from ..array_types import BoolArray, Float32Array, FloatArray
 from ..errors import InputError, OutOfRangeError, named_units
 from ..model import ResponseTable
 from ..products import FringeComponents, FringeFrame, SkyFringe, mask_bits, refuse_corrected
@@ -411,7 +411,7 @@ def _dot(one: FloatArray, two: FloatArray) -> float:
     return float(np.vdot(one, two))
 
 
-def _zero_mean(image: NDArray[np.float32], good: BoolArray) -> FloatArray:
+def _zero_mean(image: Float32Array, good: BoolArray) -> FloatArray:
     values = np.where(good, image, 0.0).astype(np.float64)
     return np.where(good, values - values.sum() / good.sum(), 0.0)
 

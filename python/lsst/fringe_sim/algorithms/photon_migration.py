@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import convolve
 
-from ..array_types import FloatArray
+from ..array_types import Float32Array, FloatArray
 from ..errors import InputError, OutOfRangeError
 from ..instrument.sky import SpectralComponent
 from ..instrument.telescope import RayBundle
@@ -109,7 +109,7 @@ def photon_migration(
     )
 
 
-def spread_charge(image: ArrayLike, kernel: ArrayLike) -> NDArray[np.float32]:
+def spread_charge(image: ArrayLike, kernel: ArrayLike) -> Float32Array:
     """Frame after photons have walked to neighbouring pixels; edges repeat the outermost pixels.
 
     ``image`` (ny, nx).

@@ -12,6 +12,7 @@ from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike, NDArray
 
 from ..array_types import BoolArray, FloatArray
+from ..blocks import block_sums
 
 DEGREE, BACKGROUND_DEGREE = 8, 1
 """Degrees of the polynomials of the map and, along either side, of a background beside the fringes."""
@@ -125,8 +126,8 @@ class RangeCells:
     ) -> RangeCells:
         """Cells of one image, and the sky at the thicknesses of a range."""
         low, high = range_um
-        weights = cell_sums(weight, cell)
-        value = cell_sums(np.where(weight > 0.0, image, 0.0) * weight, cell) / np.maximum(weights, 1e-300)
+        weights = block_sums(weight, cell)
+        value = block_sums(np.where(weight > 0.0, image, 0.0) * weight, cell) / np.maximum(weights, 1e-300)
         across = Polynomial.of(weights.shape)
         terms = np.einsum("yi,xj->yxij", across.rows, across.columns)[..., down_degrees(), across_degrees()]
         some = BACKGROUND_DEGREE + 1
@@ -174,11 +175,3 @@ class RangeCells:
         """Part of the sensor of each cell."""
         row, column = (0.5 * (self.place + 1.0) * along).astype(int).T
         return np.asarray(row * along + column)
-
-
-def cell_sums(image: FloatArray, cell: int) -> FloatArray:
-    """Sums over square cells of so many pixels; what is left at the far edges is left out."""
-    rows, columns = (side // cell for side in image.shape)
-    return np.asarray(
-        image[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell).sum(axis=(1, 3))
-    )

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import percentile_filter
 
+from ..array_types import BoolArray, Float32Array, FloatArray
 from .flat_prep_options import GAUSSIAN_MAD, FlatPrepOptions
 
-Image = NDArray[np.float32]
+Image = Float32Array
 Mask = NDArray[np.int32]
 
 _BAND_ROWS = 256  # Rows that are looked at at a time
@@ -22,9 +23,7 @@ EXCEPTIONAL = 6.0
 of a random pattern, six times the amplitude of a sine."""
 
 
-def isolated_defects(
-    image: Image, variance: Image, good: NDArray[np.bool_], options: FlatPrepOptions
-) -> NDArray[np.bool_]:
+def isolated_defects(image: Image, variance: Image, good: BoolArray, options: FlatPrepOptions) -> BoolArray:
     """Pixels far above or below all but one of their eight neighbours: hot pixels, pairs of them, cosmic rays.
 
     How far is far: `FlatPrepOptions.defect_sigma` of the noise, `FlatPrepOptions.defect_fraction` of the signal,
@@ -44,7 +43,7 @@ def isolated_defects(
 
 
 def _candidates(
-    image: Image, variance: Image, good: NDArray[np.bool_], sigma: float, rows: slice
+    image: Image, variance: Image, good: BoolArray, sigma: float, rows: slice
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Good pixels beyond one of the two neighbours along x and along y, which is cheap to see and necessary.
 
@@ -61,13 +60,8 @@ def _candidates(
 
 
 def _is_far_from_cross(
-    image: Image,
-    variance: Image,
-    good: NDArray[np.bool_],
-    sigma: float,
-    y: NDArray[np.intp],
-    x: NDArray[np.intp],
-) -> NDArray[np.bool_]:
+    image: Image, variance: Image, good: BoolArray, sigma: float, y: NDArray[np.intp], x: NDArray[np.intp]
+) -> BoolArray:
     """Whether pixels are far enough from all but one of the good neighbours along x and y, which is necessary too."""
     beside = (y, x - 1), (y, x + 1), (y - 1, x), (y + 1, x)
     value = image[y, x].astype(np.float64)
@@ -88,11 +82,11 @@ def _is_far_from_cross(
 def _is_isolated(
     image: Image,
     variance: Image,
-    good: NDArray[np.bool_],
+    good: BoolArray,
     options: FlatPrepOptions,
     y: NDArray[np.intp],
     x: NDArray[np.intp],
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     dy, dx = np.delete(np.indices((3, 3)).reshape(2, -1) - 1, 4, axis=1)
     around = y[:, None] + dy, x[:, None] + dx
     near, known = image[around].astype(np.float64), good[around]
@@ -110,7 +104,7 @@ def _is_isolated(
         return (known.sum(axis=1) > 1) & (above | below) & (excess > np.maximum(limit, spread))
 
 
-def column_means(image: Image, mask: Mask) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def column_means(image: Image, mask: Mask) -> tuple[FloatArray, BoolArray]:
     """Mean of the good pixels of each column, and whether there are enough of them to go by."""
     good = mask == 0
     count = good.sum(axis=0)
@@ -118,9 +112,7 @@ def column_means(image: Image, mask: Mask) -> tuple[NDArray[np.float64], NDArray
     return total / np.maximum(count, 1), count >= max(4, image.shape[0] // 10)
 
 
-def bad_columns(
-    mean: NDArray[np.float64], known: NDArray[np.bool_], options: FlatPrepOptions
-) -> NDArray[np.intp]:
+def bad_columns(mean: FloatArray, known: BoolArray, options: FlatPrepOptions) -> NDArray[np.intp]:
     """Greedy search: the worst columns are replaced by what their neighbours predict, until none stands out."""
     index = np.flatnonzero(known)
     profile = mean[index].copy()
@@ -151,7 +143,7 @@ def bad_columns(
     return np.unique(np.array(found, dtype=np.intp))
 
 
-def _adjacent_bad_columns(profile: NDArray[np.float64], limit: float) -> NDArray[np.intp]:
+def _adjacent_bad_columns(profile: FloatArray, limit: float) -> NDArray[np.intp]:
     """Columns, alone or side by side, that rise from those beside them as little else does nearby.
 
     How much any so many columns rise from their neighbours is known from those nearby: fringes, however strong, do it
@@ -171,9 +163,7 @@ def _adjacent_bad_columns(profile: NDArray[np.float64], limit: float) -> NDArray
     return np.array(found, dtype=np.intp)
 
 
-def _worst_group(
-    profile: NDArray[np.float64], widths: range, least: list[NDArray[np.float64]]
-) -> tuple[int, int] | None:
+def _worst_group(profile: FloatArray, widths: range, least: list[FloatArray]) -> tuple[int, int] | None:
     """First column of the group that stands out most, and the one behind it."""
     worst, group = 1.0, None
     for width, low in zip(widths, least, strict=True):
@@ -186,7 +176,7 @@ def _worst_group(
     return group
 
 
-def _rise(profile: NDArray[np.float64], width: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _rise(profile: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
     """Mean of every ``width`` columns over that of the `BESIDE` ones on either side, and by how much these differ."""
     total = np.concatenate([[0.0], np.cumsum(profile)])
     first = np.arange(BESIDE, len(profile) - width - BESIDE + 1)
@@ -196,14 +186,14 @@ def _rise(profile: NDArray[np.float64], width: int) -> tuple[NDArray[np.float64]
     return inner - 0.5 * (left + right), right - left
 
 
-def _usual_rise(rise: NDArray[np.float64], width: int) -> NDArray[np.float64]:
+def _usual_rise(rise: FloatArray, width: int) -> FloatArray:
     """What a group must exceed by the fringes around it, of which a few defects are a small part."""
     size = min(2 * (NEARBY + 8 * width) + 1, len(rise))
-    usual: NDArray[np.float64] = percentile_filter(np.abs(rise), USUAL_PERCENT, size, mode="reflect")
+    usual: FloatArray = percentile_filter(np.abs(rise), USUAL_PERCENT, size, mode="reflect")
     return EXCEPTIONAL * usual
 
 
-def _predicted(profile: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _predicted(profile: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Cubic prediction of every value from two on either side, and the range of these four."""
     p = np.pad(profile, 2, mode="edge")
     beside = np.stack([p[:-4], p[1:-3], p[3:-1], p[4:]])

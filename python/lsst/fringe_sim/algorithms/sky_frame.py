@@ -10,9 +10,9 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..array_types import BoolArray
+from ..array_types import BoolArray, Float32Array
 from ..effects import ImageGeometry, apply_to_image
 from ..errors import InputError, OutOfRangeError, named_units
 from ..instrument.bandpass import Bandpass
@@ -165,7 +165,7 @@ def simulate_sky_frame(
     )
 
 
-def _phase_cards(sigma: float, change: NDArray[np.float32] | None) -> dict[str, float]:
+def _phase_cards(sigma: float, change: Float32Array | None) -> dict[str, float]:
     """Uncertainty of the phase of the adhesive [rad per 10 K], and the rms that it leaves open."""
     if change is None:
         return {}
@@ -253,12 +253,8 @@ def component_electrons(
 
 
 def _with_image_effects(
-    model: FringeModel,
-    image: NDArray[np.float32],
-    known: BoolArray,
-    wavelength_nm: float,
-    to_electrons: float,
-) -> NDArray[np.float32]:
+    model: FringeModel, image: Float32Array, known: BoolArray, wavelength_nm: float, to_electrons: float
+) -> Float32Array:
     """Frame with the effects of sensor and read-out in it; the frame itself if there are none."""
     active = [
         item
@@ -276,7 +272,7 @@ def _with_image_effects(
     return np.where(known, mean * changed, np.nan).astype(np.float32)
 
 
-def _spread(image: NDArray[np.float32], known: BoolArray, kernel: ArrayLike) -> NDArray[np.float32]:
+def _spread(image: Float32Array, known: BoolArray, kernel: ArrayLike) -> Float32Array:
     """Frame after photon migration; pixels that are not known take part with the mean of the others."""
     mean = np.float32(image.mean(dtype=np.float64, where=known))
     spread = spread_charge(np.where(known, image, mean), kernel)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..array_types import FloatArray, FloatImage
+from ..array_types import Float32Array, FloatArray
 from ..errors import InputError, OutOfRangeError
 from ..instrument.camera import Camera
 from ..instrument.sky import SkySpectrum
@@ -248,7 +248,7 @@ class SiliconTable:
         """Largest error of both interpolations, in the units of the frame."""
         return self.error_between + max(table.interpolation_error for table in self.tables)
 
-    def frame(self, thickness_um: ArrayLike) -> FloatImage:
+    def frame(self, thickness_um: ArrayLike) -> Float32Array:
         """Frame of a thickness map [µm], ``(ny, nx)``; NaN where one of the two is not known."""
         thickness = np.asarray(thickness_um)
         if thickness.shape != self.silicon_um.shape:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..array_types import FloatArray
+from ..array_types import Float32Array, FloatArray
 from ..effects import apply_to_sky
 from ..errors import InputError, OutOfRangeError, UnknownNameError, named_units
 from ..instrument.bandpass import Bandpass
@@ -47,7 +47,7 @@ class FrameTable(Protocol):
     def interpolation_error(self) -> float:
         """Largest error of interpolation, in the units of the frame."""
 
-    def frame(self, thickness_um: ArrayLike) -> NDArray[np.float32]:
+    def frame(self, thickness_um: ArrayLike) -> Float32Array:
         """Frame of a thickness map [µm]."""
 
 

@@ -32,8 +32,7 @@ SPANS = (0, 1, 2, 4, 8, 16)
 
 LEAST_PX_OF_SPAN = 8  # Pixels in a span: fewer would not carry a cubic
 
-SPREADS = 13
-"""Spreads of the shifts over which the evidence is averaged, from a thousandth of an order to one order."""
+SPREADS = 13  # Spreads of the shifts over which the evidence is averaged, from a thousandth of an order to one order
 
 MOST_STARTS = 4  # Most common shifts from which splines begin; an order has about one
 

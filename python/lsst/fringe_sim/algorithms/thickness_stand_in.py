@@ -10,9 +10,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..array_types import FloatArray
+from ..array_types import Float32Array, FloatArray
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from ..instrument.detector import Detector
 from ..model import Setup
@@ -60,7 +59,7 @@ class ThicknessField:
 
     def draw(
         self, shape: tuple[int, int], size_mm: tuple[float, float], rng: np.random.Generator
-    ) -> NDArray[np.float32]:
+    ) -> Float32Array:
         """Thickness of one sensor.
 
         ``shape``: rows and columns of the map. The field does not depend on them, only where it is sampled.

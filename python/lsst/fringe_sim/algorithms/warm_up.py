@@ -6,8 +6,8 @@ import functools
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import Float32Array, FloatArray
 from ..instrument.sky import SkySpectrum
 from ..model import FringeModel
 from ..model.response_table import ResponseTable
@@ -22,7 +22,7 @@ from .smooth_field import Splines
 from .thickness_fit import fit_thickness
 from .thickness_fit.amplitudes import Amplitudes
 from .thickness_fit.global_fit import global_fit
-from .thickness_fit.templates import FringeTemplates
+from .thickness_fit.templates import FlatTemplates
 from .thickness_fit.uncertainty import slip_probability
 
 _WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
@@ -31,13 +31,13 @@ _ORDER_UM = 0.3
 _SETUP = "ts8_e2v"
 
 
-def _relief(side: int) -> NDArray[np.float64]:
+def _relief(side: int) -> FloatArray:
     """Thickness with a step, over which pixels have more than one surface to choose from [µm]."""
     y, x = np.mgrid[0:side, 0:side] / side
     return np.asarray(15.0 + 1.2 * x + 0.8 * y * y + np.where(x > 0.7, 0.45, 0.0))
 
 
-def _spoilt(image: NDArray[np.float64], noise: float) -> NDArray[np.float32]:
+def _spoilt(image: FloatArray, noise: float) -> Float32Array:
     """With noise, a bad column, one wavelength wrong here and there, and a patch where no thickness fits."""
     rng = np.random.default_rng(1)
     image = image + noise * rng.standard_normal(image.shape)
@@ -52,7 +52,7 @@ def _fit_cells_and_pixels() -> None:
     """The fit on templates that need no optics."""
     grid = np.arange(_RANGE_UM[0] - _ORDER_UM, _RANGE_UM[1] + _ORDER_UM, _ORDER_UM / 300)
     turns = 4.0 * np.pi * 1.55e3 / _WAVELENGTHS
-    templates = FringeTemplates(
+    templates = FlatTemplates(
         1.0 + 0.1 * np.cos(grid[:, None] * turns), float(grid[0]), _ORDER_UM / 300, _WAVELENGTHS
     )
     image = 0.1 * np.cos(_relief(128)[None] * turns[:, None, None])

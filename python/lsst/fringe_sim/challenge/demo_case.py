@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..algorithms.discovery import Verdict
+from ..array_types import FloatArray
 from ..effects import AMPLIFIERS, EFFECTS
 from ..errors import InputError
 from ..instrument.measured_thickness import e2v_321, fit_to_sensor
@@ -137,7 +137,7 @@ def draw_demo_case(seed: int, shape: tuple[int, int]) -> DemoCase:
     return DemoCase(seed, shape, {"contrast_loss.factor": CONTRAST, **second})
 
 
-def thickness_of_demo(shape: tuple[int, int]) -> NDArray[np.float64]:
+def thickness_of_demo(shape: tuple[int, int]) -> FloatArray:
     """Adhesive of a part of E2V-CCD250-321, sampled at so many rows and columns [µm]."""
     return fit_to_sensor(e2v_321(PART_PX, sampling="window", corner=CORNER_PX), shape)
 

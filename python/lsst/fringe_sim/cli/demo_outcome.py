@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..algorithms.discovery import Verdict
 from ..algorithms.night_levels import background_terms
-from ..array_types import FloatArray
+from ..array_types import Float32Array, FloatArray
 from ..challenge.demo_case import DemoCase, found_words, of_the_layers
 from ..effects import EFFECTS
 from ..products import SkyFringe, ThicknessMap
@@ -277,9 +277,7 @@ def _error_nm(found: ThicknessMap, true_um: FloatArray) -> float:
     return NM_PER_UM * float(np.median(np.abs(found.value - true_um)[found.mask == 0]))
 
 
-def _left(
-    folder: Path, name: str, true_e: NDArray[np.float32], level_e: float, row: Any | None
-) -> VisitFringes:
+def _left(folder: Path, name: str, true_e: Float32Array, level_e: float, row: Any | None) -> VisitFringes:
     """Fringes of a visit, and what is left of them; all of them where it was not corrected."""
     before = _without_background(true_e / level_e)
     path = folder / "corrected" / f"{name}_corrected.fits"

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import Float32Array, FloatArray
 from ..challenge.demo_case import DemoCase, draw_demo_case, thickness_of_demo
 from ..files import all_or_nothing, write_whole
 from ..instrument.setup import Setup
@@ -71,11 +71,11 @@ class DemoTruth:
         """What is hidden."""
         return DemoCase.from_json((self.folder / CASE).read_text(encoding="utf-8"))
 
-    def thickness_um(self) -> NDArray[np.float64]:
+    def thickness_um(self) -> FloatArray:
         """Thickness of the adhesive [µm]."""
         return thickness_of_demo(self.shape)
 
-    def fringes(self) -> list[tuple[str, NDArray[np.float32], float]]:
+    def fringes(self) -> list[tuple[str, Float32Array, float]]:
         """Of every visit: name of its file, light of the sky less its mean, and that mean [e⁻]."""
         with np.load(self.folder / FRINGES) as stored:
             return [

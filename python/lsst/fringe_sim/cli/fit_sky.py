@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
+from ..array_types import Float32Array, FloatArray
 from ..errors import InputError
 from .bad_files import refuse_bad
 from .command import DRY_RUN, EXISTING, argument, command, flag, option
@@ -19,8 +20,6 @@ from .parameters import SKY, THICKNESS_RANGE, ChosenEffects, model_effects
 from .progress import progress
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from ..algorithms.fringe_correction import CorrectionOptions
     from ..algorithms.map_from_range import RangeMap
     from ..algorithms.map_on_sky import MapOnSky
@@ -198,7 +197,7 @@ def _forecast(
     table = sky_response(model, dark, thickness_range_um=span).sky()
     shape = (frame.shape[0], frame.shape[1])
 
-    def predict(grid: NDArray[np.float64]) -> NDArray[np.float32]:
+    def predict(grid: FloatArray) -> Float32Array:
         return table.frame(grid[None, :])[0]
 
     found = forecast_of_range(predict, range_um, order_um, shape, pixels, noise)

@@ -10,7 +10,6 @@ from typing import Any
 import click
 import numpy as np
 from astropy.table import Column, Table, vstack
-from numpy.typing import NDArray
 
 from ..algorithms.cost_model import FocalPlaneCost
 from ..algorithms.field_response import (
@@ -23,6 +22,7 @@ from ..algorithms.field_response import (
 )
 from ..algorithms.focal_plane import SkyLevel, forecast_sensor, summary_table
 from ..algorithms.thickness_stand_in import ThicknessField, stand_in_thickness
+from ..array_types import FloatArray
 from ..errors import InputError
 from ..files import table_text, write_together
 from ..instrument.camera import Camera
@@ -144,7 +144,7 @@ def focal_plane(
 class _SensorLayer:
     """Thickness of the varying layer of a sensor, and the part of the sensor that it shows; `None` for all of it."""
 
-    value_um: NDArray[np.float64]
+    value_um: FloatArray
     section: SensorSection | None
 
     @classmethod
@@ -196,7 +196,7 @@ def _of_stack(settings: dict[str, Any], setup_name: str) -> dict[str, Any]:
     return kept
 
 
-def _field(model: FringeModel, sky: SkySpectrum, maps: list[NDArray[np.float64]]) -> FieldResponse:
+def _field(model: FringeModel, sky: SkySpectrum, maps: list[FloatArray]) -> FieldResponse:
     """Response at every field radius, for the thickness of all stand-ins and of the given maps."""
     beams = beam_field(model.setup.telescope)
     if beams is None:

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..effects import activate_effects, known_effects
 from ..effects.active import flat_settings
 from ..errors import InputError
@@ -45,9 +44,7 @@ def read_map(path: str | os.PathLike[str], setup: Setup, sensor: Detector | None
     return found
 
 
-def read_thickness(
-    path: str | os.PathLike[str], setup: Setup, sensor: Detector | None = None
-) -> NDArray[np.float64]:
+def read_thickness(path: str | os.PathLike[str], setup: Setup, sensor: Detector | None = None) -> FloatArray:
     """Thickness [µm] of the map that `read_map` reads; NaN where there is none."""
     return read_map(path, setup, sensor).known_um().astype(float)
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..array_types import FloatArray
 from ..errors import InputError
 from .command import DRY_RUN, command, option
 from .output import OutputFolder, output_folder
@@ -24,7 +25,6 @@ from .progress import progress
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     import numpy as np
-    from numpy.typing import NDArray
 
     from ..instrument.setup import Setup
 
@@ -111,9 +111,7 @@ def mock_flats(
     click.echo(f"{len(run.paths)} raw frames in {folder}")
 
 
-def thickness_map(
-    text: str, setup: Setup, shape: tuple[int, int], rng: np.random.Generator
-) -> NDArray[np.float64]:
+def thickness_map(text: str, setup: Setup, shape: tuple[int, int], rng: np.random.Generator) -> FloatArray:
     """Thickness map of a sensor from the argument of ``--thickness``."""
     from ..instrument.measured_thickness import e2v_321, fit_to_sensor
     from ..mock.thickness import random_field

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ..array_types import Float32Array
 from ..errors import InputError
 from .command import DRY_RUN, command, option
 from .mock_flats import thickness_map
@@ -16,8 +17,7 @@ from .parameters import BUILT_IN, SIZE, SKY, ChosenEffects, model_effects, shape
 from .progress import progress
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
-    import numpy as np
-    from numpy.typing import NDArray
+    pass
 
 VISITS = "visit_*.fits"  # in both folders
 
@@ -109,7 +109,7 @@ def _truth_folder(path: Path, out: OutputFolder) -> OutputFolder:
     return folder
 
 
-def _write_truth(path: Path, fringes: NDArray[np.float32]) -> None:
+def _write_truth(path: Path, fringes: Float32Array) -> None:
     from astropy.io import fits
 
     from ..files import all_or_nothing

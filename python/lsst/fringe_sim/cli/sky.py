@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..array_types import FloatArray
 from ..errors import InputError, OutOfRangeError, to_number
 from ..instrument.setup import LONGEST_EXPOSURE_S
 from .command import DRY_RUN, command, option
@@ -20,9 +21,6 @@ from .parameters import BUILT_IN, SKY, ChosenEffects, Quantity, model_effects
 from .progress import progress
 
 if TYPE_CHECKING:  # imported by the functions, so that --help is quick
-    import numpy as np
-    from numpy.typing import NDArray
-
     from ..algorithms.coadds import VisitPlaces
     from ..algorithms.sky_response import Response
     from ..instrument.detector import Detector
@@ -32,7 +30,7 @@ if TYPE_CHECKING:  # imported by the functions, so that --help is quick
     from ..model import FringeModel
     from ..products import SensorSection, SkyFringe
 
-    FloatArray = NDArray[np.float64]
+    FloatArray = FloatArray
 
 PERCENT = 100.0
 MARGIN_UM = 1e-6  # of the tabulated thickness beyond that of the layer

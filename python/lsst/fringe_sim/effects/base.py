@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..errors import UnknownNameError, named_units
 from ..instrument.sky import SkySpectrum
 from ..optics.system import OpticalSystem
@@ -34,7 +34,7 @@ __all__ = [
     "numbered",
 ]
 
-FloatArray = NDArray[np.float64]
+FloatArray = FloatArray
 Values = Mapping[str, float]  # Values of parameters by their names
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from ..array_types import BoolArray, FloatArray
+from ..blocks import block_sums
 from ..compiled import kernel
 
 FARTHEST_PX = 8000.0  # Distance of the centre from the middle of a sensor [px]: the radius of a wafer
@@ -108,12 +109,10 @@ def _averaged(
     """The map averaged over blocks of at least half of which are used."""
     rows, columns = image.shape[0] // factor, image.shape[1] // factor
 
-    def blocks(values: FloatArray) -> FloatArray:
-        trimmed = values[: rows * factor, : columns * factor]
-        return np.asarray(trimmed.reshape(rows, factor, columns, factor).sum(axis=(1, 3)))
-
-    number = blocks(used.astype(float))
-    mean = np.divide(blocks(np.where(used, image, 0.0)), number, out=np.zeros(number.shape), where=number > 0)
+    number = block_sums(used.astype(float), factor)
+    mean = np.divide(
+        block_sums(np.where(used, image, 0.0), factor), number, out=np.zeros(number.shape), where=number > 0
+    )
     y, x = (
         place[: n * factor].reshape(n, factor).mean(axis=1) for place, n in ((y_px, rows), (x_px, columns))
     )

@@ -12,8 +12,7 @@ from ..optics.system import OpticalSystem
 from .base import FloatArray, Parameter, PlainNullEffect, Values
 from .geometry import ImageGeometry
 
-NODE_UM = 2.0
-"""Silicon thicknesses from which the response is interpolated: nominal, and so much on both sides [µm]."""
+NODE_UM = 2.0  # Silicon thicknesses from which the response is interpolated: nominal, and so much on both sides [µm]
 
 RIPPLE_UM = 0.13
 RIPPLE_PLACES = np.array([-0.375, -0.125, 0.125, 0.375])

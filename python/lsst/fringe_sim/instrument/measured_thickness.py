@@ -8,10 +8,10 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.ndimage import map_coordinates
 
+from ..array_types import FloatArray
 from ..errors import InputError
 from ..resources import read_table
 
@@ -23,7 +23,7 @@ Sampling = Literal["resample", "window"]
 
 def e2v_321(
     shape: tuple[int, int] = E2V_SHAPE, *, sampling: Sampling = "resample", corner: tuple[int, int] = (0, 0)
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Adhesive of E2V-CCD250-321, as a smooth model of the map that Guo et al. (2022) fitted.
 
     A bicubic spline of 24 × 24 coefficients. It differs from the published map by 9.5 nm rms, which is the
@@ -42,12 +42,12 @@ def e2v_321(
 
 
 def fit_to_sensor(
-    thickness_um: NDArray[np.float64],
+    thickness_um: FloatArray,
     shape: tuple[int, int],
     *,
     sampling: Sampling = "resample",
     corner: tuple[int, int] = (0, 0),
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Bring any map to the shape of a sensor; resampling is bicubic, from pixel centres to pixel centres."""
     thickness = np.asarray(thickness_um, dtype=float)
     if thickness.ndim != 2:
@@ -60,7 +60,7 @@ def fit_to_sensor(
     return map_coordinates(thickness, grid, order=3, mode="nearest")
 
 
-def _positions(what: str, wanted: int, available: int, sampling: Sampling, first: int) -> NDArray[np.float64]:
+def _positions(what: str, wanted: int, available: int, sampling: Sampling, first: int) -> FloatArray:
     """Pixel coordinates on the large map of the ``wanted`` pixels of the small one."""
     if wanted < 1:
         raise InputError(f"number of {what}", wanted, "1 or more")
@@ -73,7 +73,7 @@ def _positions(what: str, wanted: int, available: int, sampling: Sampling, first
     return np.arange(first, first + wanted, dtype=float)
 
 
-def _clamped_basis(position: NDArray[np.float64], size: int, count: int, degree: int) -> NDArray[np.float64]:
+def _clamped_basis(position: FloatArray, size: int, count: int, degree: int) -> FloatArray:
     inner = np.linspace(0.0, size - 1.0, count - degree + 1)
     knots = np.concatenate([[0.0] * degree, inner, [size - 1.0] * degree])
     # Resampled onto more pixels than the sensor has, the outermost centres lie up to half a pixel outside.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import BoolArray, Float32Array
 from ..errors import OutOfRangeError
 from ..instrument.detector import Detector
 
@@ -41,7 +41,7 @@ class Defects:
 
 def draw_defects(
     sensor: Detector, defects: Defects, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[Float32Array, Float32Array, BoolArray]:
     """Response, added charge [electrons] and place of the blemishes of a sensor."""
     shape = sensor.shape
     response = np.ones(shape, dtype=np.float32)

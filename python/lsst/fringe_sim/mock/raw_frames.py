@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import BoolArray, FloatArray
+from ..array_types import BoolArray, Float32Array, FloatArray
 from ..descriptions import is_file_name, read_description, with_files_beside
 from ..errors import InputError, OutOfRangeError, UnknownNameError
 from ..instrument.camera import Amplifier, Camera, Detector
@@ -85,8 +85,8 @@ class MockTruth:
     optics: FlatFieldOptics
     signal: SensorSignal
     amplifiers: tuple[AmplifierState, ...]
-    response: NDArray[np.float32]
-    excess_e: NDArray[np.float32]
+    response: Float32Array
+    excess_e: Float32Array
     defective: BoolArray
 
     def light(self, wavelength_nm: float) -> FloatArray:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..array_types import FloatArray
+from ..array_types import Float32Array, FloatArray
 from ..errors import InputError
 from ..instrument.camera import Amplifier, Detector, RawSegment
 from .hidden_effects import AmplifierState, HiddenEffect
@@ -96,7 +96,7 @@ def raw_segment(amp: Amplifier) -> RawSegment:
     return amp.raw
 
 
-def _place_charge(image: NDArray[np.float32], charge: FloatArray, segment: RawSegment) -> None:
+def _place_charge(image: Float32Array, charge: FloatArray, segment: RawSegment) -> None:
     """Put the charge into the imaging section, and what transfer leaves behind into the overscans."""
     rows = slice(segment.data_y0, segment.data_y0 + charge.shape[0])
     columns = slice(segment.data_x0, segment.data_x0 + charge.shape[1])

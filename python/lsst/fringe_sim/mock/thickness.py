@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..errors import OutOfRangeError
 from ..instrument.measured_thickness import E2V_SHAPE, e2v_321, fit_to_sensor
 
@@ -28,7 +29,7 @@ def random_field(
     mean: float = 17.0,
     span: float = 6.0,
     scale: float | None = None,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Smooth Gaussian random field with a squared-exponential correlation.
 
     Random Fourier features: a sum of plane waves whose wave vectors are normally distributed.
@@ -74,13 +75,13 @@ def random_field(
 class PixelArea:
     """A thickness map over the area of its pixels: each is a plane through its own thickness."""
 
-    thickness_um: NDArray[np.float64]  # [y, x]: thickness at the centres of the pixels
+    thickness_um: FloatArray  # [y, x]: thickness at the centres of the pixels
     # slope_y, slope_x [y, x]: how the thickness rises within a pixel [µm per px]
-    slope_y: NDArray[np.float64]
-    slope_x: NDArray[np.float64]
+    slope_y: FloatArray
+    slope_x: FloatArray
 
     @classmethod
-    def of(cls, thickness_um: NDArray[np.float64]) -> PixelArea:
+    def of(cls, thickness_um: FloatArray) -> PixelArea:
         """Slopes from the neighbours; where the map has a step or a summit, a pixel does not reach beyond it."""
         slopes = [_limited_slope(thickness_um, axis) for axis in (0, 1)]
         return cls(thickness_um, slopes[0], slopes[1])
@@ -91,7 +92,7 @@ class PixelArea:
         reach = 0.5 * (np.abs(self.slope_y) + np.abs(self.slope_x))
         return float((self.thickness_um - reach).min()), float((self.thickness_um + reach).max())
 
-    def average(self, signal: Callable[..., NDArray[np.float64]], *others: PixelArea) -> NDArray[np.float64]:
+    def average(self, signal: Callable[..., FloatArray], *others: PixelArea) -> FloatArray:
         """Mean over each pixel of what depends on its thickness, and on others, by 3 × 3 nodes of Gauss's rule.
 
         The signal may have axes before those of the map.
@@ -100,9 +101,7 @@ class PixelArea:
         parts = (each[0][1] * signal(*(thickness for thickness, _ in each)) for each in nodes)
         return functools.reduce(np.add, parts)
 
-    def in_squares(
-        self, rows: NDArray[np.intp], columns: NDArray[np.intp], across: int
-    ) -> NDArray[np.float64]:
+    def in_squares(self, rows: NDArray[np.intp], columns: NDArray[np.intp], across: int) -> FloatArray:
         """Thickness in the middle of equal squares of some pixels, shape ``(N, across, across)``."""
         middle = (np.arange(across) + 0.5) / across - 0.5
         thickness, slope_y, slope_x = (
@@ -111,13 +110,13 @@ class PixelArea:
         )
         return np.asarray(thickness + slope_y * middle[:, np.newaxis] + slope_x * middle)
 
-    def _nodes(self) -> Iterator[tuple[NDArray[np.float64], float]]:
+    def _nodes(self) -> Iterator[tuple[FloatArray, float]]:
         for up, weight_y in GAUSS_NODES:
             for along, weight_x in GAUSS_NODES:
                 yield self.thickness_um + up * self.slope_y + along * self.slope_x, weight_y * weight_x
 
 
-def _limited_slope(field: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+def _limited_slope(field: FloatArray, axis: int) -> FloatArray:
     """Harmonic mean of the differences to both neighbours, zero where they disagree (van Leer 1977)."""
     result = np.zeros(field.shape)
     size = field.shape[axis]
@@ -132,7 +131,7 @@ def _limited_slope(field: NDArray[np.float64], axis: int) -> NDArray[np.float64]
     return result
 
 
-def _stretch(field: NDArray[np.float64], mean: float, span: float) -> NDArray[np.float64]:
+def _stretch(field: FloatArray, mean: float, span: float) -> FloatArray:
     """Map the range of ``field`` linearly onto ``mean ± span / 2``."""
     low, high = float(field.min()), float(field.max())
     if not high > low:

@@ -12,7 +12,7 @@ import numpy as np
 from astropy.wcs import WCS
 from numpy.typing import NDArray
 
-from ..array_types import BoolArray, ComplexArray, FloatArray
+from ..array_types import BoolArray, ComplexArray, Float32Array, FloatArray
 from ..errors import InputError
 from ..instrument.bandpass import Bandpass
 from ..instrument.detector import Detector
@@ -147,20 +147,15 @@ class Scene:
 class VisitImage:
     """Pixels of a visit."""
 
-    electrons: NDArray[np.float32]
+    electrons: Float32Array
     mask: NDArray[np.int32]
-    variance: NDArray[np.float32]
+    variance: Float32Array
     pointing: Pointing
     sources: NDArray[Any]
 
     @classmethod
     def expose(
-        cls,
-        scene: Scene,
-        sky_e: NDArray[np.float32],
-        sensor: Detector,
-        seconds: float,
-        rng: np.random.Generator,
+        cls, scene: Scene, sky_e: Float32Array, sensor: Detector, seconds: float, rng: np.random.Generator
     ) -> VisitImage:
         """Put sources, disturbances and noise on the light of the sky."""
         night = scene.conditions
@@ -222,7 +217,7 @@ def _magnitudes(bright: float, slope: float, rng: np.random.Generator) -> FloatA
     return np.asarray(COUNTED + np.log10(rng.uniform(low, high, number)) / slope)
 
 
-def _slope(shape: tuple[int, ...], rms: float, rng: np.random.Generator) -> NDArray[np.float32]:
+def _slope(shape: tuple[int, ...], rms: float, rng: np.random.Generator) -> Float32Array:
     """Light that falls off slowly over the sensor, relative to its mean."""
     y, x = (np.linspace(-1.0, 1.0, number) for number in shape)
     along, across, curved = rms * rng.standard_normal(3)
@@ -231,7 +226,7 @@ def _slope(shape: tuple[int, ...], rms: float, rng: np.random.Generator) -> NDAr
 
 
 def _draw_sources(
-    light: NDArray[np.float32], scene: Scene, pointing: Pointing, seconds: float, rng: np.random.Generator
+    light: Float32Array, scene: Scene, pointing: Pointing, seconds: float, rng: np.random.Generator
 ) -> NDArray[Any]:
     """Add all sources to an image; those whose centre lies on it are returned."""
     shape = light.shape[0], light.shape[1]
@@ -283,7 +278,7 @@ def _draw(source: galsim.GSObject, image: galsim.Image, x: float, y: float, scal
 
 
 def _add_cosmic_rays(
-    charge: NDArray[np.float32], sensor: Detector, per_cm2: float, rng: np.random.Generator
+    charge: Float32Array, sensor: Detector, per_cm2: float, rng: np.random.Generator
 ) -> None:
     """Straight tracks of particles through the silicon."""
     ny, nx = charge.shape
@@ -301,7 +296,7 @@ def _add_cosmic_rays(
         np.add.at(charge, (rows[kept], columns[kept]), np.float32(total / steps))
 
 
-def _bleed(charge: NDArray[np.float32], full_well: float) -> BoolArray:
+def _bleed(charge: Float32Array, full_well: float) -> BoolArray:
     """Spread charge beyond the full well along columns; pixels that are full."""
     for column in np.flatnonzero((charge > full_well).any(axis=0)):
         values = charge[:, column]

@@ -17,7 +17,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from ..array_types import FloatArray
+from ..array_types import Float32Array, FloatArray
 from ..effects import known_effects
 from ..errors import InputError, OutOfRangeError
 from ..files import all_or_nothing
@@ -59,7 +59,7 @@ class MockVisit:
     """A visit and what is true of it."""
 
     path: Path  # its file
-    fringes: NDArray[np.float32]  # (ny, nx): light of the sky less its mean over the sensor [e⁻]
+    fringes: Float32Array  # (ny, nx): light of the sky less its mean over the sensor [e⁻]
     level_e: float  # mean light of the sky [e⁻]
 
 
@@ -69,7 +69,7 @@ class DetectedSky:
 
     names: tuple[str, ...]  # OH bands, then continua
     n_bands: int  # how many of them are bands
-    light: NDArray[np.float32]  # (len(names), ny, nx): electrons per second and pixel
+    light: Float32Array  # (len(names), ny, nx): electrons per second and pixel
 
 
 def detected_sky(

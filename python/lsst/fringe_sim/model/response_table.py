@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from ..array_types import FloatArray
+from ..array_types import Float32Array, FloatArray
 from ..compiled import contiguous, kernel, run_shares
 from ..errors import ConvergenceError, InputError, OutOfRangeError, named_units
 from ..notebook import OneLine
@@ -82,7 +82,7 @@ class ResponseTable(OneLine):
         return np.ascontiguousarray(np.moveaxis(spline.c[::-1], 0, -1).swapaxes(0, 1))
 
     @functools.cached_property
-    def _packed(self) -> NDArray[np.float32]:
+    def _packed(self) -> Float32Array:
         """Flat coefficients of every row, with one more cell for the last thickness itself."""
         end = np.zeros((len(self.values), 1, 4))
         end[:, 0, 0] = self.values[:, -1]
@@ -114,9 +114,7 @@ class ResponseTable(OneLine):
         return out.reshape(len(out), *thickness.shape)
 
     @named_units
-    def frame(
-        self, thickness_um: ArrayLike, row: int = 0, out: NDArray[np.float32] | None = None
-    ) -> NDArray[np.float32]:
+    def frame(self, thickness_um: ArrayLike, row: int = 0, out: Float32Array | None = None) -> Float32Array:
         """Image of one exposure, in one pass over the thickness map with all processor cores.
 
         Parameters

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..array_types import ComplexArray, FloatArray
 from ..descriptions import Description, read_description
 from ..errors import InputError, ResourceError, StackError, UnknownNameError, named_units, printable_name
 from ..notebook import OneLine
@@ -160,17 +161,17 @@ class LayerStack(OneLine):
         return tuple(layer.name for layer in self.layers)
 
     @property
-    def thickness_um(self) -> NDArray[np.float64]:
+    def thickness_um(self) -> FloatArray:
         """Thickness of every layer [µm], shape ``(L,)``; the ends are infinite."""
         return np.array([layer.thickness_um for layer in self.layers])
 
     @property
-    def roughness_nm(self) -> NDArray[np.float64]:
+    def roughness_nm(self) -> FloatArray:
         """Rms roughness of the upper interface of layers 1…L-1 [nm], shape ``(L-1,)``."""
         return np.array([layer.roughness_nm for layer in self.layers[1:]])
 
     @property
-    def thickness_spread_um(self) -> NDArray[np.float64]:
+    def thickness_spread_um(self) -> FloatArray:
         """Rms thickness spread of every layer inside a pixel [µm], shape ``(L,)``."""
         return np.array([layer.thickness_spread_um for layer in self.layers])
 
@@ -187,9 +188,9 @@ class LayerStack(OneLine):
         return self.names.index(name)
 
     @named_units
-    def indices(self, wavelength_nm: ArrayLike, temperature_k: ArrayLike = 300.0) -> NDArray[np.complex128]:
+    def indices(self, wavelength_nm: ArrayLike, temperature_k: ArrayLike = 300.0) -> ComplexArray:
         """Complex index of every layer, shape ``(L, ...)`` with the broadcast shape of the arguments."""
-        by_medium: dict[int, NDArray[np.complex128]] = {}
+        by_medium: dict[int, ComplexArray] = {}
         for layer in self.layers:
             if id(layer.medium) not in by_medium:
                 by_medium[id(layer.medium)] = layer.medium.index(wavelength_nm, temperature_k)

@@ -13,7 +13,7 @@ from ..algorithms.pca import fit_pca_from_thickness
 from ..array_types import FloatArray
 from ..instrument.night import NightHistory
 from .laboratory import MAP_RANGE_UM, RAFT
-from .section import Context, Curve, Graph, Section
+from .section import Context, Curve, Graph, PaperSection
 from .sky import RANGE_UM, lines_only
 
 PERCENT = 100.0
@@ -28,7 +28,7 @@ RAFT_UM = (13.8, 28.5)  # Adhesive of all nine sensors, if the thinnest place of
 TREECORR_PX = 64
 
 
-def components(context: Context) -> Section:
+def components(context: Context) -> PaperSection:
     """Principal components of a night."""
     response, night = lines_only(context.setup("lsst_e2v")), NightHistory.guo2022()
     scales = [night.band_scale(time, response.bands) for time in range(len(night))]
@@ -42,7 +42,7 @@ def components(context: Context) -> Section:
         Curve(hours, PERCENT * found.scores[:, k] / np.abs(found.scores).max(), f"component {k + 1}", "o")
         for k in range(min(2, found.scores.shape[1]))
     )
-    return Section(
+    return PaperSection(
         "Components of a night: section 5.4",
         "Eleven hourly frames with the variation of the OH bands that the paper takes from Noll et al. (2015).",
         {"first_component": PERCENT * ratio[0], "second_component": PERCENT * ratio[1], "corrected": left},
@@ -60,7 +60,7 @@ def components(context: Context) -> Section:
     )
 
 
-def coadd(context: Context) -> Section:
+def coadd(context: Context) -> PaperSection:
     """Figure 16."""
     maps = _raft_maps(context)
     table = lines_only(context.setup("lsst_e2v"), range_um=RAFT_UM if maps else RANGE_UM).sky()
@@ -91,7 +91,7 @@ def coadd(context: Context) -> Section:
     rms = PERCENT * float(np.sqrt(np.mean([pattern.var() for pattern in patterns])))
     one = "one sensor, where the paper has nine (their maps are not at hand)"
     sensors = "the nine sensors of the raft" if maps else one
-    return Section(
+    return PaperSection(
         "Coadds: Fig. 16",
         f"Coadds of randomly placed and rotated pieces of {sensors} (fringes {rms:.2f} % rms, uncorrected) with "
         "photon noise.",

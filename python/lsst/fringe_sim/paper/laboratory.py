@@ -18,7 +18,7 @@ from ..mock.raw_frames import setup_optics
 from ..mock.thickness import E2V_SHAPE
 from ..model import FringeModel
 from ..products import FlatExposures, FringeCube
-from .section import Context, Curve, Graph, Picture, Section, columns, missing
+from .section import Context, Curve, Graph, PaperSection, Picture, columns, missing
 
 PERCENT = 100.0
 LAB = "ts8_e2v"
@@ -56,7 +56,7 @@ RAFT = (
 """Slots of RTM-020 and serial numbers of their sensors, upper row of the raft first."""
 
 
-def one_pixel(context: Context) -> Section:
+def one_pixel(context: Context) -> PaperSection:
     """Figure 4."""
     wavelength, amplitude = published_pixel()
     detection = FringeModel.from_setup(context.setup(LAB))
@@ -75,7 +75,7 @@ def one_pixel(context: Context) -> Section:
         Curve(searched, PERCENT * misfit_total, "1 − R − T"),
         Curve(damped.searched_um, PERCENT * damped.searched_rms, "detection layer, contrast and offset free"),
     )
-    return Section(
+    return PaperSection(
         "One pixel: Fig. 4",
         "Twelve flats at pixel (2100, 2100) of E2V-CCD250-321, as published, fitted by exhaustive search.",
         {"pixel_total": absolute, "pixel_contrast": damped.contrast},
@@ -104,7 +104,7 @@ def _fit_as_published(
     return float(searched[best]), departure[:, best], searched, misfit
 
 
-def flat_contrast(context: Context) -> Section:
+def flat_contrast(context: Context) -> PaperSection:
     """Figures 2, 5 and 6 and the first row of Table 2."""
     phase = (np.arange(256) + 0.5) / 256.0
     lab = context.setup(LAB)
@@ -134,7 +134,7 @@ def flat_contrast(context: Context) -> Section:
         curves.append(Curve(place, PERCENT * simulated, "simulated as published (Fig. 5)", "--"))
     flat = detection.response(context.thickness_um, [WAVELENGTH_NM])[0]
     picture = PERCENT * (flat / flat.mean() - 1.0)
-    return Section(
+    return PaperSection(
         "Flats at 960 nm: Figs. 2, 5, 6 and Table 2",
         "What the model says about a flat in parallel light of 2 nm bandwidth, for both observables. The contrast of "
         "the laboratory is the open question of the paper: see the errata.",
@@ -148,7 +148,7 @@ def flat_contrast(context: Context) -> Section:
     )
 
 
-def row_3000(context: Context) -> Section:
+def row_3000(context: Context) -> PaperSection:
     """Figure 6."""
     names = ("row_phase", "row_ratio", "row_correlation")
     text = (
@@ -156,7 +156,7 @@ def row_3000(context: Context) -> Section:
     )
     flat, layer = context.map_path(MEASURED_FLAT), context.map_path(MEASURED_MAP)
     if flat is None or layer is None:
-        return Section("A row: Fig. 6", f"{text} Flat and map are not at hand.", missing(*names))
+        return PaperSection("A row: Fig. 6", f"{text} Flat and map are not at hand.", missing(*names))
     columns, measured, thickness = _row(flat, layer)
     total = FringeModel.from_setup(context.setup(LAB), observable="total")
     response = total.response(thickness, [WAVELENGTH_NM])[0]
@@ -175,7 +175,7 @@ def row_3000(context: Context) -> Section:
         Curve(columns, PERCENT * (measured - level), "measured (Fig. 2), less its trend", "."),
         Curve(columns, PERCENT * simulated, "1 − R − T less its mean, as published"),
     )
-    return Section(
+    return PaperSection(
         "A row: Fig. 6",
         f"{text} Pixels of the figure are single ones, with the noise of photons; the paper smooths them.",
         values,
@@ -206,7 +206,7 @@ def _fitted_fringe(trend: FloatArray, phase: FloatArray, values: FloatArray) -> 
     return complex(found[-2], -found[-1])
 
 
-def thickness_fit(context: Context) -> Section:
+def thickness_fit(context: Context) -> PaperSection:
     """Section 3.3, on flats whose thickness is known: of the model that is fitted, and of another one."""
     model = FringeModel.from_setup(context.setup(LAB), {"contrast_loss.factor": FIT_CONTRAST})
     detail = context.detail_um[: FIT_SHAPE[0], : FIT_SHAPE[1]]
@@ -226,7 +226,7 @@ def thickness_fit(context: Context) -> Section:
             name = {"guo2022": "walk from pixel to pixel", "global": "all pixels at once"}[method]
             picture = 1e3 * np.where(good, wrong, np.nan)
             pictures.append(Picture(f"{name}, {kind}", "fitted − true [nm]", picture, True))
-    return Section(
+    return PaperSection(
         "Thickness fit: section 3.3",
         f"{len(wavelength)} simulated flats of {detail.shape[1]} × {detail.shape[0]} px with "
         f"{PERCENT * FIT_NOISE:g} % of noise and the measured contrast of 2 %, fitted with the algorithm of the "
@@ -253,7 +253,7 @@ def _foreign_light(layer: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
     return np.stack([slope * table.evaluate(row, layer) for row in range(len(wavelength_nm))])
 
 
-def raft(context: Context) -> Section:
+def raft(context: Context) -> PaperSection:
     """Figure 7."""
     text = "Flats at 960 nm from the published maps of the nine sensors, as 1 − R − T, on one scale."
     paths = [
@@ -261,7 +261,7 @@ def raft(context: Context) -> Section:
         for slot, serial in RAFT
     ]
     if not all(path for _, path in paths):
-        return Section("Raft: Fig. 7", f"{text} The maps are not at hand.", missing("row_jumps"))
+        return PaperSection("Raft: Fig. 7", f"{text} The maps are not at hand.", missing("row_jumps"))
     model = FringeModel.from_setup(context.setup(LAB), observable="total")
     order = float(model.fringe_order_um(WAVELENGTH_NM))
     pictures, jumping = [], 0
@@ -276,7 +276,7 @@ def raft(context: Context) -> Section:
         flat = PERCENT * (image / image.mean() - 1.0)
         pictures.append(Picture(title, "flat / mean − 1 [%]", flat, True, E2V_SHAPE[0] / len(flat)))
     values = {"row_jumps": float(jumping)}
-    return Section("Raft: Fig. 7", text, values, tuple(pictures), "The nine sensors of RTM-020.")
+    return PaperSection("Raft: Fig. 7", text, values, tuple(pictures), "The nine sensors of RTM-020.")
 
 
 def row_jumps(thickness_um: FloatArray, order_um: float) -> int:

@@ -16,7 +16,7 @@ from ..instrument.telescope import RayBundle, Telescope, batoid_optic
 from ..model import FringeModel
 from ..optics import Beam, Illumination
 from ..resources import read_table
-from .section import Context, Curve, Graph, Section, columns, missing
+from .section import Context, Curve, Graph, PaperSection, columns, missing
 
 PERCENT = 100.0
 SECOND_RADIATION_CONSTANT = 1.4387769  # hc/k [cm K]
@@ -37,7 +37,7 @@ PATH_RAYS = 7  # Rays on either side of the axis of which the path through the t
 FAINTEST = 1e-6  # Weight below which lines are not drawn
 
 
-def oh_lines(context: Context) -> Section:
+def oh_lines(context: Context) -> PaperSection:
     """Section 4.1, Figure 8, Eq. 4."""
     bandpass = Bandpass.from_name("lsst_y")
     sky = SkySpectrum(EmissionLines.oh(), airmass=1.2)
@@ -52,7 +52,7 @@ def oh_lines(context: Context) -> Section:
         for item in bands
         if item.name in NAMED_BANDS
     )
-    return Section(
+    return PaperSection(
         "OH lines: section 4.1, Fig. 8, Eq. 4",
         "Weights of the lines behind air, mirrors and filter, without the detector, whose efficiency the stack "
         "computes. The lines are those of PALACE, not those of the figure.",
@@ -121,7 +121,7 @@ def _vibrational_temperature() -> float:
     return float(-SECOND_RADIATION_CONSTANT / np.polyfit(energy, population, 1)[0])
 
 
-def angles(context: Context) -> Section:
+def angles(context: Context) -> PaperSection:
     """Figures 9 and 10, Eq. 5."""
     centre, edge = (Telescope.from_name("lsst").trace(field) for field in (0.0, EDGE_DEG))
     hsc = Telescope.from_name("hsc").trace(0.0)
@@ -135,7 +135,7 @@ def angles(context: Context) -> Section:
         converged = _rms(context, rays.beam(BEAM_NODES))
         ratio = [_rms(context, _histogram_beam(rays, bins)) / converged for bins in BINS]
         convergence.append(Curve(np.array(BINS, dtype=float), np.array(ratio), label, "o"))
-    return Section(
+    return PaperSection(
         "Beams: Figs. 9 and 10, Eq. 5",
         "Angles of incidence traced through the telescopes, and what too few of them do to the sum of Eq. 5.",
         {
@@ -209,7 +209,7 @@ def _rms(context: Context, beam: Beam) -> float:
     return fringe_amplitudes(table.lookup(layer)[0]).rms
 
 
-def photon_walk(context: Context) -> Section:
+def photon_walk(context: Context) -> PaperSection:
     """Section 4.2, Figure 11."""
     setup = context.setup("lsst_e2v")
     light = SkySpectrum(EmissionLines.oh()).components(Bandpass.from_name("lsst_y"))
@@ -223,7 +223,7 @@ def photon_walk(context: Context) -> Section:
         if field_deg > 0.0:
             values["walk_edge"] = PERCENT * walk.fraction_inside(10.0)
             values["walk_pixel"] = PERCENT * walk.fraction_inside(5.0)
-    return Section(
+    return PaperSection(
         "Photons in the silicon: section 4.2, Fig. 11",
         "How far photons walk sideways before they are absorbed.",
         values,

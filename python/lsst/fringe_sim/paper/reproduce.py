@@ -12,9 +12,9 @@ from astropy.table import Table
 from ..notebook import do_nothing
 from . import coadds, laboratory, optics, sky, stack
 from .published import Finding, published_number
-from .section import COLD_SILICON, Context, Section
+from .section import COLD_SILICON, Context, PaperSection
 
-SECTIONS: tuple[Callable[[Context], Section], ...] = (
+SECTIONS: tuple[Callable[[Context], PaperSection], ...] = (
     stack.layers,
     stack.bandwidth,
     stack.other_vendor,
@@ -55,7 +55,7 @@ STATUSES = ("agrees", "erratum", "differs", "skipped")
 class Reproduction:
     """Sections with their findings."""
 
-    sections: tuple[Section, ...]  # what was computed
+    sections: tuple[PaperSection, ...]  # what was computed
     findings: tuple[tuple[Finding, ...], ...]  # findings of each section
 
     @property
@@ -122,7 +122,7 @@ def findings_table(findings: Sequence[Finding]) -> Table:
 
 def reproduce(
     context: Context,
-    sections: Sequence[Callable[[Context], Section]] | None = None,
+    sections: Sequence[Callable[[Context], PaperSection]] | None = None,
     advance: Callable[[], None] = do_nothing,
 ) -> Reproduction:
     """Recompute the paper; ``advance`` is called after each section."""

@@ -55,7 +55,7 @@ class Picture:
 
 
 @dataclass(frozen=True, eq=False)
-class Section:
+class PaperSection:
     """A section of the paper, recomputed."""
 
     # title, text: heading, and what was done

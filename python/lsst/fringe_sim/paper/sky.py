@@ -25,7 +25,7 @@ from ..instrument.readout import (
 from ..instrument.sky import EmissionLines, SkySpectrum
 from ..model import FringeModel, Setup
 from ..optics import Illumination
-from .section import Context, Curve, Graph, Picture, Section, columns, missing
+from .section import Context, Curve, Graph, PaperSection, Picture, columns, missing
 
 PERCENT = 100.0
 AIRMASS = 1.2
@@ -57,7 +57,7 @@ def lines_only(
     return sky_response(model, SkySpectrum(EmissionLines.oh(), airmass=AIRMASS), thickness_range_um=range_um)
 
 
-def monocam(context: Context) -> Section:
+def monocam(context: Context) -> PaperSection:
     """Section 5.1, Figure 12."""
     frame = lines_only(context.setup("monocam")).sky().lookup(context.thickness_um)[0]
     values = {
@@ -69,7 +69,7 @@ def monocam(context: Context) -> Section:
     if theirs is not None:
         values["monocam_curve"], values["monocam_shape"] = theirs.half_peak_to_peak, theirs.correlation
         curves = theirs.curves
-    return Section(
+    return PaperSection(
         "MonoCam: section 5.1, Fig. 12",
         "OH lines through the LSST y band at f/4 and −120 °C, with the adhesive of E2V-CCD250-321.",
         values,
@@ -83,7 +83,7 @@ def monocam(context: Context) -> Section:
     )
 
 
-def hsc(context: Context) -> Section:
+def hsc(context: Context) -> PaperSection:
     """Section 5.2, Figure 13."""
     rng = context.rng("HSC")
     relief = gaussian_filter(rng.standard_normal((HSC_SIDE, HSC_SIDE)), HSC_SCALE, mode="wrap")
@@ -105,7 +105,7 @@ def hsc(context: Context) -> Section:
     if published is not None:
         place, amplitude = columns(published, "diagonal_pixel", "amp")
         curves.append(Curve(place / place.max(), amplitude, "measured frame of Fig. 13", "--"))
-    return Section(
+    return PaperSection(
         "Hyper Suprime-Cam: section 5.2, Fig. 13",
         "A random relief of 1.74 µm in 200 µm of silicon, HSC optics and filter. Only amplitudes can be compared: "
         "the rms of the whole frame, with the continuum of a dark sky in it, with that of the measured one.",
@@ -139,7 +139,7 @@ def _hsc_frame(context: Context, layer: FloatArray, measured: FloatArray | None)
     return PERCENT * fringe_amplitudes(whole.sky().lookup(layer)[0]).rms / float(np.nanstd(measured))
 
 
-def lsst(context: Context) -> Section:
+def lsst(context: Context) -> PaperSection:
     """Section 5.3, Figure 14."""
     centre, edge = (
         lines_only(context.setup("lsst_e2v"), field).sky().lookup(context.thickness_um)[0]
@@ -166,7 +166,7 @@ def lsst(context: Context) -> Section:
         Picture(name, *_relative(frame), True, context.step_px)
         for name, frame in (("field centre", centre), (f"{EDGE_DEG}° off axis", edge))
     )
-    return Section(
+    return PaperSection(
         "LSST: section 5.3, Fig. 14, Table 2",
         "The same sensor behind the LSST optics. The paper does not say which amplitude it means; its 0.2 % and "
         "0.04 % are compared with the rms, and half peak to peak with what its figure shows.",
@@ -181,7 +181,7 @@ def lsst(context: Context) -> Section:
     )
 
 
-def surface_brightness(context: Context) -> Section:
+def surface_brightness(context: Context) -> PaperSection:
     """Figure 15, section 5.4."""
     model = FringeModel.from_setup(context.setup("lsst_e2v"))
     setup, band = model.setup, Bandpass.from_name(model.setup.bandpass)
@@ -204,7 +204,7 @@ def surface_brightness(context: Context) -> Section:
     whole = lines_only(context.setup("lsst_e2v")).sky().lookup(context.thickness_um)[0]
     fringe = sky * lines * 2.0 * fringe_amplitudes(whole).half_peak_to_peak
     smooth_fringe = gaussian_filter(sky * relative, SMOOTHING_PX, truncate=2.0)
-    return Section(
+    return PaperSection(
         "Surface brightness: Fig. 15, section 5.4",
         f"A dark zenith sky of {sky_e:.0f} electrons per pixel in {setup.exposure_s:g} s, {sky:.1f} µJy arcsec⁻². "
         "Fringes and noise are kept apart, both smoothed like the figure.",

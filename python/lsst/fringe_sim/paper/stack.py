@@ -12,16 +12,15 @@ from ..model import FringeModel
 from ..optics import Beam, LayerStack, Medium, get_medium
 from ..optics.illumination import SIGMA_PER_FWHM, GaussianProfile
 from ..optics.system import OpticalSystem
-from .section import Context, Curve, Graph, Section, columns, missing
+from .section import Context, Curve, Graph, PaperSection, columns, missing
 
 PERCENT = 100.0
 LAB_K = 183.0
-SHARP_NM = 0.1
-"""Bandwidth [nm] that leaves 97 % of the fringes of the silicon, with which those of 1 nm are compared."""
+SHARP_NM = 0.1  # Bandwidth [nm] that leaves 97 % of the fringes of the silicon, with which those of 1 nm are compared
 NINETY_NINE = float(np.log(100.0))  # Optical depths that absorb 99 %
 
 
-def layers(context: Context) -> Section:
+def layers(context: Context) -> PaperSection:
     """Table 1, Eqs. 1 and 3."""
     stack = context.stack
     adhesive = stack.position("adhesive")
@@ -31,7 +30,7 @@ def layers(context: Context) -> Section:
     silicon = float(get_medium(context.silicon).index(1000.0, LAB_K).real)
     thickness = np.linspace(5.0, 30.0, 200)
     spacing = wavelength**2 / (2e3 * index * thickness + wavelength)
-    return Section(
+    return PaperSection(
         "Sensor: Table 1, Eqs. 1 and 3",
         "The stack as shipped, the fringe spacing in wavelength and the thickness of one fringe order.",
         {
@@ -103,7 +102,7 @@ def _fundamental(wavelength_nm: FloatArray, ripple: FloatArray, spacing_nm: floa
     return float(np.abs((ripple * wave).sum()))
 
 
-def bandwidth(context: Context) -> Section:
+def bandwidth(context: Context) -> PaperSection:
     """Figure 1."""
     wide, close = np.arange(820.0, 1000.0, 0.5), np.arange(958.0, 970.0, 0.1)
     stack = context.stack
@@ -133,7 +132,7 @@ def bandwidth(context: Context) -> Section:
         place, theirs = columns(narrow_curve, "wavelength", "absorption")
         inset.append(Curve(place, theirs, "Fig. 1, inset", "--"))
     label = "absorbed in the stack, 1 − R − T"
-    return Section(
+    return PaperSection(
         "Bandwidth: Fig. 1",
         "Absorption of the whole stack with 14 µm of adhesive at 183 K. A line of 2 nm washes the fringes of the "
         "silicon out, one of 1 nm does not.",
@@ -153,7 +152,7 @@ def _depth_um(silicon: Medium, wavelength_nm: ArrayLike, temperature_k: float) -
     return NINETY_NINE * 1e-3 * wavelength / (4.0 * np.pi * extinction)
 
 
-def absorption_depth(context: Context) -> Section:
+def absorption_depth(context: Context) -> PaperSection:
     """Figure 3."""
     wavelength = np.arange(650.0, 1051.0, 2.0)
     silicon = get_medium(context.silicon)
@@ -186,7 +185,7 @@ def absorption_depth(context: Context) -> Section:
         values["depth_temperature"] = float(trial[int(np.argmin(misfit))])
         place, depth = cold_place, cold_depth
         curves.append(Curve(place, depth, "Fig. 3, labelled 183 K", "--"))
-    return Section(
+    return PaperSection(
         "Absorption depth: Fig. 3",
         "Depth of silicon that absorbs 99 % of the light; the paper takes the temperature law of Green (2008).",
         values,
@@ -195,7 +194,7 @@ def absorption_depth(context: Context) -> Section:
     )
 
 
-def other_vendor(context: Context) -> Section:
+def other_vendor(context: Context) -> PaperSection:
     """Section 2.3."""
     thickness = np.linspace(99.5, 100.5, 400)
 
@@ -207,7 +206,7 @@ def other_vendor(context: Context) -> Section:
         return np.asarray(response / trend - 1.0)
 
     parallel, fast = fringe(0.0), fringe(1.0 / 2.4)
-    return Section(
+    return PaperSection(
         "ITL sensors: section 2.3",
         "With a black coating over the adhesive only the silicon fringes. A converging beam of f/1.2 averages that "
         "away even at a bandwidth of 1 nm.",

@@ -203,11 +203,7 @@ def write_hdus(
 
 
 def write_summed(
-    target: Path,
-    hdus: Sequence[Any],
-    verify: str = "fix",
-    *,
-    finish: Callable[[Path], None] | None = None,
+    target: Path, hdus: Sequence[Any], verify: str = "fix", *, finish: Callable[[Path], None] | None = None
 ) -> None:
     """Write HDUs with their checksums, in which nothing is of the clock; ``verify`` as of astropy.
 

@@ -11,6 +11,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from ..array_types import Float32Array
 from ..errors import InputError
 from . import _check as check
 from .fits_product import DETECTOR, MASK, Card, Extension, Image, SensorProduct
@@ -75,7 +76,7 @@ class CombinedBias(SensorProduct):
         No frames, noises that are no numbers, metadata that a header cannot hold.
     """
 
-    image: NDArray[np.float32]
+    image: Float32Array
     mask: NDArray[np.int32]
     noise_adu: Mapping[str, float]
     n_frames: int

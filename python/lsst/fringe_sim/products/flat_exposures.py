@@ -10,6 +10,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import FloatArray
 from ..errors import FrameFormatError, InputError, OutOfRangeError, named_units, without_unit
 from ..notebook import OneLine
 from . import _check as check
@@ -35,12 +36,12 @@ class FlatExposures(OneLine):
         Time in which charge was gathered, in seconds; 0 (the default) where it is not known.
     """
 
-    wavelength_nm: NDArray[np.float64]
-    bandwidth_fwhm_nm: NDArray[np.float64]
-    temperature_k: NDArray[np.float64]
-    f_number: NDArray[np.float64] = field(default_factory=lambda: np.array(np.inf))
-    level_e: NDArray[np.float64] = field(default_factory=lambda: np.array(0.0))
-    dark_time_s: NDArray[np.float64] = field(default_factory=lambda: np.array(0.0))
+    wavelength_nm: FloatArray
+    bandwidth_fwhm_nm: FloatArray
+    temperature_k: FloatArray
+    f_number: FloatArray = field(default_factory=lambda: np.array(np.inf))
+    level_e: FloatArray = field(default_factory=lambda: np.array(0.0))
+    dark_time_s: FloatArray = field(default_factory=lambda: np.array(0.0))
 
     def __post_init__(self) -> None:
         number = None  # that of the wavelengths, which come first
@@ -69,7 +70,7 @@ class _Column:
     infinite: bool = False
     default: float | None = None
 
-    def check(self, values: ArrayLike, number: int | None) -> NDArray[np.float64]:
+    def check(self, values: ArrayLike, number: int | None) -> FloatArray:
         values = without_unit(self.name, values, self.unit or "")
         if number is not None and not isinstance(values, list | tuple) and np.ndim(values) == 0:
             values = np.full(number, values)

@@ -10,6 +10,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from ..array_types import Float32Array, FloatArray
 from ..errors import FrameFormatError, OutOfRangeError
 from . import _check as check
 from . import _fits as io
@@ -37,7 +38,7 @@ class _Spectrum(Extension):
         return {name: np.array(rows[name], dtype=np.float64) for name in _COLUMNS}
 
 
-def _spectrum(name: str, values: object, number: int) -> NDArray[np.float64]:
+def _spectrum(name: str, values: object, number: int) -> FloatArray:
     array = check.as_float_array(name, np.asarray(values), 1, np.float64)
     if array.size != number:
         raise FrameFormatError(name, f"{array.size} values", f"{number}, one for each component")
@@ -81,11 +82,11 @@ class FringeComponents(FitsProduct):
         Metadata that a header cannot hold.
     """
 
-    mean: NDArray[np.float32]
-    components: NDArray[np.float32]
-    explained_variance: NDArray[np.float64]
-    explained_variance_ratio: NDArray[np.float64]
-    scores: NDArray[np.float64]
+    mean: Float32Array
+    components: Float32Array
+    explained_variance: FloatArray
+    explained_variance_ratio: FloatArray
+    scores: FloatArray
     mask: NDArray[np.int32]
     metadata: Mapping[str, Any] = field(default_factory=dict)
     detector: str = ""

@@ -11,6 +11,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import Float32Array, FloatArray
 from ..errors import FrameFormatError, InputError, OutOfRangeError, UnknownNameError, named_units
 from . import _check as check
 from . import _fits as io
@@ -71,13 +72,13 @@ class FringeCube(FitsProduct):
         An unknown unit, a thickness without the name of its layer, metadata that a header cannot hold.
     """
 
-    image: NDArray[np.float32]
-    variance: NDArray[np.float32]
+    image: Float32Array
+    variance: Float32Array
     mask: NDArray[np.int16]
     exposures: FlatExposures
     unit: str = "electron"
-    thickness: NDArray[np.float32] | None = None
-    thickness_sigma: NDArray[np.float32] | None = None
+    thickness: Float32Array | None = None
+    thickness_sigma: Float32Array | None = None
     layer: str = ""
     detector: str = ""
     metadata: Mapping[str, Any] = field(default_factory=dict)
@@ -115,12 +116,12 @@ class FringeCube(FitsProduct):
         return (self.image.shape[0], self.image.shape[1], self.image.shape[2])
 
     @property
-    def wavelength_nm(self) -> NDArray[np.float64]:
+    def wavelength_nm(self) -> FloatArray:
         """Wavelength of each plane, in nm."""
         return self.exposures.wavelength_nm
 
     @property
-    def level_e(self) -> NDArray[np.float64]:
+    def level_e(self) -> FloatArray:
         """Mean of the good pixels of each plane [electrons]; 0 where it is not known."""
         if self.unit != "electron":
             return self.exposures.level_e
@@ -298,8 +299,8 @@ class FringeCube(FitsProduct):
 class _Stack:
     """Planes of a cube while they come in."""
 
-    image: NDArray[np.float32]
-    variance: NDArray[np.float32]
+    image: Float32Array
+    variance: Float32Array
     mask: NDArray[np.int16]
     detector: str
     metadata: dict[str, Any]
@@ -325,7 +326,7 @@ class _Stack:
         return stack
 
     @property
-    def wavelength_nm(self) -> NDArray[np.float64]:
+    def wavelength_nm(self) -> FloatArray:
         return np.array([row[0] for row in self.rows])
 
     @property

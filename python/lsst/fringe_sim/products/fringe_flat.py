@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import Float32Array
 from ..errors import named_units
 from .fits_product import DETECTOR, MASK, Card, Image, SensorProduct
 
@@ -52,8 +53,8 @@ class FringeFlat(SensorProduct):
         A scalar that is not physical, or metadata that a header cannot hold.
     """
 
-    image: NDArray[np.float32]
-    variance: NDArray[np.float32]
+    image: Float32Array
+    variance: Float32Array
     mask: NDArray[np.int32]
     wavelength_nm: float
     bandwidth_fwhm_nm: float

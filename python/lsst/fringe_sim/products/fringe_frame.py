@@ -11,6 +11,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from ..array_types import Float32Array
 from ..errors import InputError, OutOfRangeError
 from . import _fits as io
 from .fits_product import DETECTOR, MASK, Card, Image, SensorProduct
@@ -54,9 +55,9 @@ class FringeFrame(SensorProduct):
         No filter, a malformed date, or metadata that a header cannot hold.
     """
 
-    image: NDArray[np.float32]
+    image: Float32Array
     mask: NDArray[np.int32]
-    variance: NDArray[np.float32]
+    variance: Float32Array
     physical_filter: str
     creation_datetime: str
     metadata: Mapping[str, Any] = field(default_factory=dict)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import Float32Array, FloatArray
 from ..errors import FrameFormatError
 from .fits_product import DETECTOR, FILTER, MASK, Card, FitsProduct, Image
 from .fringe_frame import FringeFrame
@@ -63,10 +64,10 @@ class FringeTemplates(FitsProduct):
         Arrays of the wrong type or shape, or a pixel without a number.
     """
 
-    coverage: NDArray[np.float32]
-    patterns: NDArray[np.float32]
-    variance: NDArray[np.float32]
-    scores: NDArray[np.float64]
+    coverage: Float32Array
+    patterns: Float32Array
+    variance: Float32Array
+    scores: FloatArray
     mask: NDArray[np.int32]
     creation_datetime: str
     metadata: Mapping[str, Any] = field(default_factory=dict)

@@ -17,6 +17,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from ..array_types import BoolArray, Float32Array
 from ..errors import FrameFormatError, InputError, printable_name, to_number
 from ..instrument.raw_header import header_value
 from ..resources import complete_fits, open_user_fits, refuse_damage
@@ -168,7 +169,7 @@ def write_images(
     target: Path,
     images: Mapping[int, NDArray[Any]],
     cards: Mapping[int, Mapping[str, Any]],
-    uncorrected: Mapping[int, NDArray[np.bool_]],
+    uncorrected: Mapping[int, BoolArray],
     primary: Mapping[str, Any],
     *,
     added: bool = False,
@@ -247,7 +248,7 @@ class _Layout:
     """Where a pipeline puts masks and variances."""
 
     mask: Callable[[ObservedImage, fits.HDUList, Mapping[str, Any]], IntArray | None]
-    variance: Callable[[ObservedImage, fits.HDUList, Mapping[str, Any]], NDArray[np.float32] | None]
+    variance: Callable[[ObservedImage, fits.HDUList, Mapping[str, Any]], Float32Array | None]
 
 
 def _layout_of(image: ObservedImage, hdus: fits.HDUList) -> _Layout:
@@ -326,9 +327,7 @@ def _decam_mask(image: ObservedImage, _: fits.HDUList, header: Mapping[str, Any]
     return _named(_DECAM_CODES, stored, bits=False)
 
 
-def _decam_variance(
-    image: ObservedImage, _: fits.HDUList, __: Mapping[str, Any]
-) -> NDArray[np.float32] | None:
+def _decam_variance(image: ObservedImage, _: fits.HDUList, __: Mapping[str, Any]) -> Float32Array | None:
     path = _sibling(image.path, "_oow")
     return None if path is None else _inverse(_companion(path, image))
 
@@ -375,9 +374,7 @@ def _plane(name: str) -> str:
     return "SUSPECT" if name == "VIGNETTED" else "BAD"
 
 
-def _own_variance(
-    image: ObservedImage, hdus: fits.HDUList, _: Mapping[str, Any]
-) -> NDArray[np.float32] | None:
+def _own_variance(image: ObservedImage, hdus: fits.HDUList, _: Mapping[str, Any]) -> Float32Array | None:
     variance = _beside(hdus, image, _VARIANCES)
     if variance is not None:
         return np.array(variance.data, dtype=np.float32)
@@ -395,7 +392,7 @@ def _own_variance(
     return values if kind.startswith("variance") else values**2
 
 
-def _inverse(weight: NDArray[Any]) -> NDArray[np.float32]:
+def _inverse(weight: NDArray[Any]) -> Float32Array:
     """Variance of an inverse variance; NaN where that is 0, and nothing is known."""
     known = np.asarray(weight, dtype=np.float64)
     return np.divide(1.0, known, out=np.full(known.shape, np.nan), where=known > 0).astype(np.float32)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import Float32Array
 from .fits_product import DETECTOR, FILTER, MASK, Card, Image, SensorProduct
 from .sky_frame import SkyFringe
 
@@ -40,9 +41,9 @@ class ObservedFrame(SensorProduct):
         Metadata that a header cannot hold.
     """
 
-    image: NDArray[np.float32]
+    image: Float32Array
     mask: NDArray[np.int32]
-    variance: NDArray[np.float32] | None = None
+    variance: Float32Array | None = None
     unit: str = ""
     metadata: Mapping[str, Any] = field(default_factory=dict)
     detector: str = ""

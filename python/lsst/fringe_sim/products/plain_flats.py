@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import BoolArray, Float32Array
 from ..errors import FrameFormatError, InputError, named_units
 from ..instrument.raw_header import DeclaredHeader, header_value
 from ..instrument.raw_layout import AmplifierLayout, Section, amplifier_layouts
@@ -139,7 +139,7 @@ class PlainImage:
             raise InputError("IMGTYPE", self.kind, "flat", source=self.source)
         return self.wavelength_nm
 
-    def _read(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def _read(self) -> tuple[Float32Array, BoolArray]:
         """Pixels as they stand in the file, after ``BSCALE`` and ``BZERO``, and whether they are saturated.
 
         Those of amplifiers are put where they belong, less the median of the overscan at their side, if there is one.
@@ -161,14 +161,14 @@ class PlainImage:
                 counts[part.place], full[part.place] = _of_amplifier(image, part.layout, part.full)
         return counts, full
 
-    def in_electrons(self, counts: NDArray[np.float32]) -> NDArray[np.float32]:
+    def in_electrons(self, counts: Float32Array) -> Float32Array:
         """Counts times the gain of each amplifier."""
         electrons = np.empty_like(counts)
         for part in self.parts:
             electrons[part.place] = np.float32(part.gain) * counts[part.place]
         return electrons
 
-    def read_noise_e(self) -> NDArray[np.float32]:
+    def read_noise_e(self) -> Float32Array:
         """Read noise of every pixel [electrons]."""
         noise = np.empty(self.shape, np.float32)
         for part in self.parts:
@@ -310,7 +310,7 @@ class _Once:
         self._seen: dict[str, PlainImage] = {}
         self.copies: list[str] = []
 
-    def read(self, image: PlainImage) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
+    def read(self, image: PlainImage) -> tuple[Float32Array, BoolArray] | None:
         """Pixels and whether they are saturated, `None` of a copy; equal pixels under another header are refused.
 
         Images of one value have no light to tell.
@@ -335,8 +335,8 @@ def _is_of_another_camera(header: Any) -> bool:
 
 
 def _of_amplifier(
-    image: NDArray[np.float32], layout: AmplifierLayout, full: float
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    image: Float32Array, layout: AmplifierLayout, full: float
+) -> tuple[Float32Array, BoolArray]:
     """Pixels of an amplifier as they lie on the sensor, less its overscan; whether they are saturated."""
     flip = slice(None, None, -1 if layout.flip_y else 1), slice(None, None, -1 if layout.flip_x else 1)
     pixels, overscan = image[layout.imaging][flip], image[layout.serial_overscan]

@@ -15,8 +15,8 @@ from typing import Any, Self
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
+from ..array_types import FloatArray
 from ..errors import FrameFormatError, InputError, OutOfRangeError
 from ..instrument.detector import Detector
 
@@ -157,9 +157,7 @@ class SensorSection:
                 cards[f"CD{axis}_{other}F"] = cosine * step * 1e-3 * detector.pixel_um
 
 
-def section_pixels(
-    shape: tuple[int, int], header: Mapping[str, Any]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def section_pixels(shape: tuple[int, int], header: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
     """Rows and columns of the sensor at which the pixels of an image are centred.
 
     ``header``: its keywords; without one of `SECTION_KEYWORDS` the image begins at pixel 0. Returns (ny,) and
@@ -193,6 +191,6 @@ def _first_centre(ends: tuple[int, int], step: float) -> float:
     return ends[0] + 0.5 * (step - math.copysign(1.0, step))
 
 
-def _centres(ends: tuple[int, int], size: int) -> NDArray[np.float64]:
+def _centres(ends: tuple[int, int], size: int) -> FloatArray:
     step = _step(ends, size)
     return _first_centre(ends, step) + step * np.arange(size, dtype=np.float64)

@@ -10,6 +10,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from ..array_types import Float32Array
 from ..errors import InputError, UnknownNameError, named_units
 from . import _fits as io
 from .fits_product import DETECTOR, FILTER, MASK, Card, Image, SensorProduct
@@ -85,7 +86,7 @@ class SkyFringe(SensorProduct):
         An unknown unit, a scalar that is not physical, metadata that a header cannot hold.
     """
 
-    image: NDArray[np.float32]
+    image: Float32Array
     mask: NDArray[np.int32]
     unit: str
     mean_electrons: float
@@ -127,7 +128,7 @@ class SkyFringe(SensorProduct):
     def _picture(self) -> tuple[NDArray[Any], str, bool]:
         return 100.0 * self.fraction(), "sky / mean − 1 [%]", True
 
-    def fraction(self) -> NDArray[np.float32]:
+    def fraction(self) -> Float32Array:
         """Fringe pattern (sky - mean) / mean, whatever the unit."""
         if self.unit == "fraction":
             return self.image

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import FloatArray
 from ..errors import FrameFormatError, InputError, named_units, without_unit
 from ..notebook import InNotebook
 from . import _check as check
@@ -116,12 +117,12 @@ class SkyFrames(InNotebook):
         return next((frame.detector for frame in self.frames if frame.detector), "")
 
     @property
-    def thickness_um(self) -> NDArray[np.float64]:
+    def thickness_um(self) -> FloatArray:
         """Thickness [µm]; NaN where it is not known."""
         return self.thickness.known_um().astype(float)
 
     @property
-    def thickness_sigma_um(self) -> NDArray[np.float64]:
+    def thickness_sigma_um(self) -> FloatArray:
         """Uncertainty of the thickness [µm]."""
         return self.thickness.sigma.astype(float)
 

@@ -12,6 +12,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from ..array_types import Float32Array, FloatArray
 from ..errors import FrameFormatError, InputError, OutOfRangeError
 from ..instrument.setup import Setup
 from ..resources import open_user_fits, refuse_damage
@@ -86,17 +87,17 @@ class ThicknessMap(SensorProduct):
         No layer, or metadata that a header cannot hold.
     """
 
-    value: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-    chi2: NDArray[np.float32]
-    slip_probability: NDArray[np.float32]
+    value: Float32Array
+    sigma: Float32Array
+    chi2: Float32Array
+    slip_probability: Float32Array
     mask: NDArray[np.int32]
     layer: str
     metadata: Mapping[str, Any] = field(default_factory=dict)
     n_wavelengths: NDArray[np.int32] | None = None
     detector: str = ""
     flats: FlatFit | None = None
-    contrast_map: NDArray[np.float32] | None = None
+    contrast_map: Float32Array | None = None
 
     CARDS = (DETECTOR, Card("layer", "LAYER", "layer", kind=str, empty=False))
     EXTENSIONS = (
@@ -122,12 +123,12 @@ class ThicknessMap(SensorProduct):
         return self.value, f"{self.layer} [µm]", False
 
     @property
-    def contrast(self) -> NDArray[np.float64] | None:
+    def contrast(self) -> FloatArray | None:
         """Fringe amplitude over that of the model at each wavelength; `None` if the fit did not learn it."""
         return None if self.flats is None else self.flats.contrast
 
     @property
-    def contrast_sigma(self) -> NDArray[np.float64] | None:
+    def contrast_sigma(self) -> FloatArray | None:
         """Standard uncertainty of `contrast`."""
         return None if self.flats is None else self.flats.contrast_sigma
 
@@ -206,7 +207,7 @@ class ThicknessMap(SensorProduct):
         setup.refuse_vendor_of(self.detector, source or self.detector)
         return self.of_layer(layer or setup.varying, source)
 
-    def known_um(self) -> NDArray[np.float32]:
+    def known_um(self) -> Float32Array:
         """Thickness [µm], NaN where there is none; what a mask only doubts keeps its value."""
         missing = self.mask & mask_bits("NO_DATA")
         return np.where(missing, np.float32(np.nan), self.value).astype(np.float32)

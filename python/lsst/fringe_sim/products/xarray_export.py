@@ -112,10 +112,7 @@ def read_exported(path: str | os.PathLike[str]) -> ThicknessMap | FringeCube | S
     source = str(path)
     if not Path(path).is_file():
         raise InputError("file", source, "an existing FITS file")
-    with (
-        refuse_damage("FITS file", "an undamaged FITS file", source),
-        open_user_fits(path) as hdus,
-    ):
+    with refuse_damage("FITS file", "an undamaged FITS file", source), open_user_fits(path) as hdus:
         # A cube from elsewhere does not say what it is.
         name = hdus[0].header.get(PRODUCT_KEY) or ("FringeCube" if "EXPOSURES" in hdus else "")
     if name not in EXPORTED:

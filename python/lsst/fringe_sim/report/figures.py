@@ -16,8 +16,10 @@ from matplotlib.ticker import MaxNLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from ..algorithms.flat_prep_options import GAUSSIAN_MAD
+from ..array_types import Float32Array, FloatArray
+from ..blocks import means_of_known
 from ..products import FringeComponents, FringeFrame, SkyFringe, ThicknessMap
-from ..style import LINES, TITLE_PLACE, block_mean, draw_image, figure, finite_range, panels, show_image
+from ..style import LINES, TITLE_PLACE, draw_image, figure, finite_range, panels, show_image
 
 if TYPE_CHECKING:
     from ..algorithms.coadds import Coadds
@@ -50,7 +52,7 @@ def map_row(count: int) -> Iterator[tuple[Figure, list[Axes]]]:
         yield made, panels(made, count, count, MAP_MARGINS)
 
 
-def contrast_figure(contrast_map: NDArray[np.float32], step_px: float = 1.0) -> Figure:
+def contrast_figure(contrast_map: Float32Array, step_px: float = 1.0) -> Figure:
     """Contrast in blocks of a sensor, ``step_px`` wide, over that of the whole."""
     with map_row(1) as (made, (axes,)):
         show_image(
@@ -130,7 +132,7 @@ def residuals_figure(
     standard deviation of a pixel, as a fraction; of cells beside each other if not given.
     """
     block = max(1, min(residual.shape[1:]) // RESIDUAL_CELLS)
-    coarse = np.stack([block_mean(np.asarray(plane, dtype=float), block) for plane in residual])
+    coarse = np.stack([means_of_known(np.asarray(plane, dtype=float), block) for plane in residual])
     sigma = pixel_noise(coarse) if noise is None else np.asarray(noise) / block
     size = f"means over {block} × {block} px" if block > 1 else "pixels"
     return _gallery_figure(
@@ -143,7 +145,7 @@ def residuals_figure(
     )
 
 
-def pixel_noise(images: NDArray[np.floating]) -> NDArray[np.float64]:
+def pixel_noise(images: NDArray[np.floating]) -> FloatArray:
     """Standard deviation of what neighbours in images do not share, shape ``(W,)``; NaN where none can tell.
 
     ``images`` (W, ny, nx), NaN where a pixel is not known.
@@ -350,6 +352,6 @@ def single_pixel_figure(
         return made
 
 
-def _fraction(frame: SkyFringe) -> NDArray[np.float64]:
+def _fraction(frame: SkyFringe) -> FloatArray:
     image = np.asarray(frame.image, dtype=float)
     return image if frame.unit == "fraction" else image / frame.mean_electrons - 1.0

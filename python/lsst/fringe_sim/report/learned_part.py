@@ -19,8 +19,7 @@ from .page import Report
 
 PERCENT = 100.0
 
-SIDE = 64
-"""Samples along a side of a pattern that is drawn: the finest line of a correction has so many half waves."""
+SIDE = 64  # Samples along a side of a pattern that is drawn: the finest line of a correction has so many half waves
 
 MOST_EXPOSURES = 12
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from ..paper.published import Finding
 from ..paper.reproduce import Reproduction, findings_table
-from ..paper.section import Graph, Picture, Section
+from ..paper.section import Graph, PaperSection, Picture
 from ..style import figure, panels, show_image
 from .figures import CURVE_INCH, MAP_INCH
 from .page import Origin, Report
@@ -82,7 +82,7 @@ def _summary(made: Reproduction, open_points: Sequence[Finding]) -> list[tuple[s
     ]
 
 
-def section_figures(section: Section) -> Iterator[Figure]:
+def section_figures(section: PaperSection) -> Iterator[Figure]:
     """Panels of a section, in rows."""
     if not section.panels:
         return

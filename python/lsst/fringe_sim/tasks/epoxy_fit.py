@@ -8,7 +8,6 @@ from collections.abc import Iterable
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lsst.pex.config import ChoiceField, Field, ListField, RangeField
 from lsst.pipe import base
@@ -18,6 +17,7 @@ from ..algorithms import fit_thickness
 from ..algorithms.flat_conditions import model_of_flats
 from ..algorithms.template_errors import template_errors
 from ..algorithms.thickness_fit import SILICON_FIELDS, Nuisances, SiliconSearch, remarks, silicon_map
+from ..array_types import FloatArray
 from ..errors import InputError
 from ..instrument.detector import Detector
 from ..model import LABORATORY_TEMPERATURE, Setup
@@ -224,7 +224,7 @@ class EpoxyFitTask(base.PipelineTask):
             free = dataclasses.replace(free, zones=config.level_zones, gain_accuracy=math.inf)
         return dataclasses.replace(free, illumination_degree=config.illumination_degree)
 
-    def _check_wavelengths(self, found_nm: NDArray[np.float64], setup: Setup, detector: Detector) -> str:
+    def _check_wavelengths(self, found_nm: FloatArray, setup: Setup, detector: Detector) -> str:
         """Refuse too few wavelengths; return, and report, the usual ones that are missing."""
         distinct = len(set(np.round(found_nm, 3)))
         if distinct < self.config.min_wavelengths:

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lsst.daf.butler import DataCoordinate
 from lsst.pex.config import ChoiceField, Field, FieldValidationError, ListField
@@ -17,6 +16,7 @@ from lsst.pipe.base.connectionTypes import Output
 
 from ..algorithms.photon_migration import photon_migration
 from ..algorithms.sky_frame import simulate_sky_frame, throughput_electrons
+from ..array_types import FloatArray
 from ..errors import OutOfRangeError
 from ..instrument.bandpass import Bandpass
 from ..instrument.detector import Detector
@@ -235,7 +235,7 @@ class SkyFringeSimTask(base.PipelineTask):
 
 
 @functools.lru_cache(maxsize=4)
-def _charge_kernel(sky_model: SkyModel) -> NDArray[np.float64]:
+def _charge_kernel(sky_model: SkyModel) -> FloatArray:
     """Where the photons of a pixel at the centre of a sensor are absorbed."""
     model, sky, _ = sky_model.response()
     setup = model.setup

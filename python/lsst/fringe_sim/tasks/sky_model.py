@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lsst.daf.butler import DataCoordinate
 from lsst.pex.config import ChoiceField, Field, FieldValidationError, ListField, RangeField
@@ -21,6 +20,7 @@ from ..algorithms.sky_frame import sky_response
 from ..algorithms.sky_of_maps import SiliconSeries, known_silicon_um, silicon_nodes_um, sky_of_maps
 from ..algorithms.sky_response import Response
 from ..algorithms.thickness_stand_in import stand_in_thickness
+from ..array_types import Float32Array, FloatArray
 from ..effects import activate_effects, known_effects
 from ..effects.active import settings_of
 from ..errors import InputError, to_number
@@ -73,9 +73,7 @@ class SkyModel:
         flat = FlatSpectrum.from_name(self.flat_spectrum) if self.flat_spectrum else None
         return dataclasses.replace(dark, flat=flat)
 
-    def response(
-        self, silicon_um: NDArray[np.float64] | None = None
-    ) -> tuple[FringeModel, SkySpectrum, Response]:
+    def response(self, silicon_um: FloatArray | None = None) -> tuple[FringeModel, SkySpectrum, Response]:
         """Model, sky and response, shared by the exposures of a night that this process simulates.
 
         The response takes seconds, for every thickness of the silicon, a frame tenths of one. ``silicon_um``: map of
@@ -107,7 +105,7 @@ def _response(sky_model: SkyModel) -> tuple[FringeModel, SkySpectrum, SiliconSer
 class SensorSky(NamedTuple):
     """A sensor under the sky: thickness of its layer [µm], NaN where a map is not known, and what it responds."""
 
-    known_um: NDArray[np.float32]
+    known_um: Float32Array
     sky_model: SkyModel
     model: FringeModel
     sky: SkySpectrum
@@ -187,11 +185,7 @@ class SkyModelConfig(FringeModelConfig):
         return stand_in_thickness(Setup.from_name(choice.setup), detector, self.stand_in_seed, shape)
 
     def sky_model(
-        self,
-        detector: Detector,
-        airmass: float,
-        thickness_um: NDArray[np.float32],
-        header: Mapping[str, Any],
+        self, detector: Detector, airmass: float, thickness_um: Float32Array, header: Mapping[str, Any]
     ) -> SkyModel:
         """What the response of a sensor depends on; the header of its map says which part of it the map shows."""
         rows, columns = thickness_um.shape

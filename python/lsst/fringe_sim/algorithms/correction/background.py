@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from ...array_types import FloatArray
+from ...array_types import Float32Array, FloatArray
 from ...compiled import run_threaded
 from ...errors import OutOfRangeError
 
@@ -77,10 +77,7 @@ class BackgroundTerms:
     """
 
     def __init__(
-        self,
-        shape: tuple[int, int],
-        spacing_px: float = SPACING_PX,
-        amplifiers: AmplifierGrid | None = None,
+        self, shape: tuple[int, int], spacing_px: float = SPACING_PX, amplifiers: AmplifierGrid | None = None
     ) -> None:
         if not spacing_px > 0.0:
             raise OutOfRangeError("spacing of the background [px]", spacing_px, "positive")
@@ -135,15 +132,13 @@ class BackgroundTerms:
             term = np.concatenate([term, level[..., None]], axis=2)
         return coefficient, term
 
-    def surface(self, coefficient: FloatArray) -> NDArray[np.float32]:
+    def surface(self, coefficient: FloatArray) -> Float32Array:
         """The background with these coefficients, shape ``shape``."""
         made = np.empty(self.shape, dtype=np.float32)
         self.for_bands(coefficient, made.__setitem__)
         return made
 
-    def for_bands(
-        self, coefficient: FloatArray, work: Callable[[slice, NDArray[np.float32]], object]
-    ) -> None:
+    def for_bands(self, coefficient: FloatArray, work: Callable[[slice, Float32Array], object]) -> None:
         """Call ``work`` with some rows at a time and the background there, in threads."""
         splines = coefficient[: int(np.prod(self._grid))].reshape(self._grid)
         across = (splines @ self.columns.splines.T).astype(np.float32)

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from scipy.fft import irfft2, rfft2
 from scipy.ndimage import uniform_filter
 
+from ...array_types import BoolArray, Float32Array
+
 __all__ = ["shrink_noise"]
 
 WINDOW_PX = 128
@@ -22,8 +24,8 @@ FILLINGS = 4  # Times that pixels without a value get the one that the others le
 
 
 def shrink_noise(
-    pattern: NDArray[Any], variance: NDArray[Any], known: NDArray[np.bool_]
-) -> tuple[NDArray[np.float32], float]:
+    pattern: NDArray[Any], variance: NDArray[Any], known: BoolArray
+) -> tuple[Float32Array, float]:
     """What is expected of a pattern of fringes, given a noisy measurement of it.
 
     Parameters
@@ -66,7 +68,7 @@ class _Windows:
     When the pixels without a value are filled once more, only windows in which there are such are worked out again.
     """
 
-    def __init__(self, known: NDArray[np.bool_], noise: float) -> None:
+    def __init__(self, known: BoolArray, noise: float) -> None:
         self.size = min(WINDOW_PX, 2 * (min(known.shape) // 2))
         bell = np.sin(np.pi * (np.arange(self.size) + 0.5) / self.size)
         self.window = np.outer(bell, bell).astype(np.float32)
@@ -81,7 +83,7 @@ class _Windows:
             for y in self.places[0]
         ]
         self.total = np.zeros(gaps.shape, dtype=np.float32)
-        self.last: dict[tuple[int, int], NDArray[np.float32]] = {}
+        self.last: dict[tuple[int, int], Float32Array] = {}
         self.gains: list[float] = []
 
     @property
@@ -89,7 +91,7 @@ class _Windows:
         """Part of the variance of the noise that is left."""
         return float(np.mean(self.gains))
 
-    def shrink(self, image: NDArray[np.float32], *, again: bool = False) -> NDArray[np.float32]:
+    def shrink(self, image: Float32Array, *, again: bool = False) -> Float32Array:
         """The image without most of its noise."""
         padded = np.pad(image, self.padding, mode="symmetric")
         for y, gaps in zip(self.places[0], self.gaps, strict=True):
@@ -102,7 +104,7 @@ class _Windows:
                         self.last[y, x] = made
         return self.total[self.inside]
 
-    def _row(self, padded: NDArray[np.float32], y: int, columns: list[int]) -> NDArray[np.float32]:
+    def _row(self, padded: Float32Array, y: int, columns: list[int]) -> Float32Array:
         pieces = np.stack([padded[y : y + self.size, x : x + self.size] for x in columns])
         wave = rfft2(pieces * self.window)
         power = uniform_filter(wave.real**2 + wave.imag**2, (1, 3, 3), mode=("nearest", "wrap", "nearest"))

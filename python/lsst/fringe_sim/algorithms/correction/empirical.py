@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...array_types import BoolArray, FloatArray
+from ...array_types import BoolArray, Float32Array, FloatArray
 from ...errors import InputError, UndeterminedError
 from ...notebook import do_nothing
 from .background import AMPLIFIERS_UNKNOWN, SPACING_PX, AmplifierGrid, BackgroundTerms
@@ -98,8 +98,8 @@ class ObservedTemplates:
         Whether the frames have a sky, of which the templates are parts; or in the unit of the frames.
     """
 
-    patterns: NDArray[np.float32]
-    variance: NDArray[np.float32]
+    patterns: Float32Array
+    variance: Float32Array
     coverage: NDArray[np.int32]
     scores: FloatArray
     gain: FloatArray
@@ -107,9 +107,9 @@ class ObservedTemplates:
 
 
 def fit_templates(
-    frames: Sequence[Callable[[], tuple[NDArray[Any], NDArray[np.float32]]]],
+    frames: Sequence[Callable[[], tuple[NDArray[Any], Float32Array]]],
     options: TemplateOptions | None = None,
-    prior: Sequence[NDArray[np.float32]] = (),
+    prior: Sequence[Float32Array] = (),
     advance: Callable[[], None] = do_nothing,
 ) -> ObservedTemplates:
     """Find the fringes that frames of one sensor share.
@@ -144,7 +144,7 @@ def fit_templates(
     shape = frames[0]()[0].shape
     background = BackgroundTerms(shape, chosen.spacing_px, chosen.amplifiers)
     with _Stack(len(frames), shape) as stack:
-        patterns: list[NDArray[np.float32]] = list(prior)
+        patterns: list[Float32Array] = list(prior)
         level, bare = np.ones(len(frames)), np.zeros(len(frames), dtype=bool)
         found: _Decomposition | None = None
         gain = np.zeros(0)
@@ -194,7 +194,7 @@ class _Stack:
         self._file: Any = None
         if 8 * int(np.prod(size)) > IN_MEMORY and not in_memory:
             self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed by __exit__
-            both: NDArray[np.float32] = np.memmap(self._file, dtype=np.float32, shape=(2, *size), mode="w+")
+            both: Float32Array = np.memmap(self._file, dtype=np.float32, shape=(2, *size), mode="w+")
         else:
             both = np.zeros((2, *size), dtype=np.float32)
         self.values, self.weight = both
@@ -210,8 +210,8 @@ class _Stack:
     def fill(
         self,
         place: int,
-        frame: Callable[[], tuple[NDArray[Any], NDArray[np.float32]]],
-        patterns: Sequence[NDArray[np.float32]],
+        frame: Callable[[], tuple[NDArray[Any], Float32Array]],
+        patterns: Sequence[Float32Array],
         background: BackgroundTerms,
     ) -> tuple[float, bool]:
         """Take background and objects off a frame; the level of its sky, and whether that was subtracted before."""
@@ -229,7 +229,7 @@ class _Stack:
         rows = max(1, BAND_BYTES // (4 * self.frames * self.shape[1]))
         return [slice(start, start + rows) for start in range(0, self.shape[0], rows)]
 
-    def strips(self, prior: Sequence[NDArray[np.float32]]) -> tuple[_Stack, list[NDArray[np.float32]]]:
+    def strips(self, prior: Sequence[Float32Array]) -> tuple[_Stack, list[Float32Array]]:
         """Some strips of all frames, and of the patterns that are expected, which memory holds."""
         if self._file is None or self.shape[0] <= STRIPS * JUDGED_ROWS:
             return self, list(prior)
@@ -249,15 +249,15 @@ class _Stack:
 
 @dataclass(frozen=True, eq=False)
 class _Decomposition:
-    patterns: NDArray[np.float32]
-    variance: NDArray[np.float32]
+    patterns: Float32Array
+    variance: Float32Array
     scores: FloatArray
 
 
 def _decompose(
     stack: _Stack,
     number: int,
-    prior: Sequence[NDArray[np.float32]],
+    prior: Sequence[Float32Array],
     frames: NDArray[Any] | None = None,
     scores: FloatArray | None = None,
     steps: int = STEPS,
@@ -281,7 +281,7 @@ def _decompose(
     return _Decomposition(patterns, variance, scores)
 
 
-def _gram(patterns: NDArray[np.float32]) -> FloatArray:
+def _gram(patterns: Float32Array) -> FloatArray:
     """Sums of products of patterns, single precision within a row only."""
     return np.asarray(
         np.einsum("kyx,lyx->kly", patterns, patterns, optimize=True).sum(axis=2, dtype=np.float64)
@@ -289,11 +289,8 @@ def _gram(patterns: NDArray[np.float32]) -> FloatArray:
 
 
 def _shrunk(
-    patterns: NDArray[np.float32],
-    variance: NDArray[np.float32],
-    known: BoolArray,
-    prior: Sequence[NDArray[np.float32]],
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    patterns: Float32Array, variance: Float32Array, known: BoolArray, prior: Sequence[Float32Array]
+) -> tuple[Float32Array, Float32Array]:
     made, left = np.empty_like(patterns), np.empty_like(patterns)
     basis = np.stack([each[known] for each in prior], axis=1) if prior else None
     for number, pattern in enumerate(patterns):
@@ -308,7 +305,7 @@ def _shrunk(
 
 
 def _first_scores(
-    stack: _Stack, number: int, prior: Sequence[NDArray[np.float32]], chosen: NDArray[Any]
+    stack: _Stack, number: int, prior: Sequence[Float32Array], chosen: NDArray[Any]
 ) -> FloatArray:
     """Scores of the patterns that are expected, then principal axes of the frames with zeros for what is missing."""
     gram = np.zeros((chosen.size, chosen.size))
@@ -332,7 +329,7 @@ def _first_scores(
 
 def _patterns_of(
     stack: _Stack, scores: FloatArray, chosen: NDArray[Any]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], BoolArray]:
+) -> tuple[Float32Array, Float32Array, BoolArray]:
     """Every pixel of the patterns from the frames that see it, its variance, and whether enough of them do."""
     number = scores.shape[1]
     patterns = np.zeros((number, *stack.shape), dtype=np.float32)
@@ -388,7 +385,7 @@ def _solved(
 
 
 def _scores_of(
-    stack: _Stack, patterns: NDArray[np.float32], chosen: NDArray[Any], part: NDArray[Any] | None = None
+    stack: _Stack, patterns: Float32Array, chosen: NDArray[Any], part: NDArray[Any] | None = None
 ) -> FloatArray:
     """Scores of frames by weighted least squares over their pixels, or over a part of them."""
     number = len(patterns)
@@ -409,7 +406,7 @@ def _scores_of(
     return scores
 
 
-def _held_out_gain(stack: _Stack, prior: Sequence[NDArray[np.float32]], most: int) -> FloatArray:
+def _held_out_gain(stack: _Stack, prior: Sequence[Float32Array], most: int) -> FloatArray:
     """What 0, 1, 2, … patterns take of the squared pulls of frames that they were not made of, until it falls."""
     rows, columns = (np.arange(side) // CHECK_PX for side in stack.shape)
     white = (np.add.outer(rows, columns) % 2).astype(np.float32)
@@ -422,7 +419,7 @@ def _held_out_gain(stack: _Stack, prior: Sequence[NDArray[np.float32]], most: in
 
 
 def _fold_gain(
-    stack: _Stack, number: int, prior: Sequence[NDArray[np.float32]], fold: int, white: NDArray[np.float32]
+    stack: _Stack, number: int, prior: Sequence[Float32Array], fold: int, white: Float32Array
 ) -> float:
     left = np.arange(fold, stack.frames, FOLDS)
     others = np.setdiff1d(np.arange(stack.frames), left)

@@ -11,7 +11,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from ...array_types import BoolArray, FloatArray
+from ...array_types import BoolArray, Float32Array, FloatArray
 from ...errors import InputError
 
 POINT, EXTENDED = "point", "extended"
@@ -52,11 +52,11 @@ class Measured:
 
 
 def inject_sources(
-    image: NDArray[np.float32],
+    image: Float32Array,
     free: BoolArray,
     noise: float,
     pixel_arcsec: float,
-    correct: Callable[[NDArray[np.float32]], tuple[NDArray[np.float32], NDArray[np.float32]]],
+    correct: Callable[[Float32Array], tuple[Float32Array, Float32Array]],
     options: InjectionOptions | None = None,
 ) -> list[Measured]:
     """Draw sources into a copy of a frame, correct it anew, and measure them.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label, uniform_filter
 
-from ...array_types import BoolArray, FloatArray
+from ...array_types import BoolArray, Float32Array, FloatArray
 from ...compiled import run_threaded
 from .background import BackgroundTerms
 from .scales import ScaleFit, coefficient_of, rounding_of, scale_fit, settle
@@ -68,16 +68,16 @@ class FrameFit:
 
     fit: ScaleFit
     objects: BoolArray
-    background: NDArray[np.float32]
-    residual: NDArray[np.float32]
+    background: Float32Array
+    residual: Float32Array
     sums: FrameSums
     solution: Solution
 
 
 def fit_frame(
     image: NDArray[Any],
-    weight: NDArray[np.float32],
-    patterns: Sequence[NDArray[np.float32]],
+    weight: Float32Array,
+    patterns: Sequence[Float32Array],
     background: BackgroundTerms,
     *,
     rounds: int = ROUNDS,
@@ -116,7 +116,7 @@ def fit_frame(
     return FrameFit(fit, objects, background.surface(fit.coefficient), residual, sums, solution)
 
 
-def find_objects(residual: NDArray[np.float32], good: BoolArray, rounding: float = 0.0) -> BoolArray:
+def find_objects(residual: Float32Array, good: BoolArray, rounding: float = 0.0) -> BoolArray:
     """Pixels of objects, with what surrounds them.
 
     Parameters
@@ -143,7 +143,7 @@ def find_objects(residual: NDArray[np.float32], good: BoolArray, rounding: float
     return objects
 
 
-def _single(residual: NDArray[np.float32], good: BoolArray, limit: float, binned: int) -> BoolArray:
+def _single(residual: Float32Array, good: BoolArray, limit: float, binned: int) -> BoolArray:
     """Squares of pixels of which one lies off by more than a limit."""
     above = np.empty([-(-size // binned) for size in good.shape], dtype=bool)
 
@@ -156,7 +156,7 @@ def _single(residual: NDArray[np.float32], good: BoolArray, limit: float, binned
 
 
 def _above(
-    residual: NDArray[np.float32], good: BoolArray, width: float, threshold: float, binned: int, noise: float
+    residual: Float32Array, good: BoolArray, width: float, threshold: float, binned: int, noise: float
 ) -> BoolArray:
     """Squares of pixels in which the smoothed residual stands above its own scatter."""
     shape = [-(-size // binned) for size in good.shape]
@@ -186,7 +186,7 @@ def _above(
     return np.asarray(seen & (smooth > threshold * scatter))
 
 
-def _scatter_around(values: NDArray[np.float32], good: BoolArray, side: int) -> NDArray[np.float32]:
+def _scatter_around(values: Float32Array, good: BoolArray, side: int) -> Float32Array:
     """Root mean square of the values below 0 in the neighbourhood of each: objects only add light, waves do not."""
     cell = max(1, side // CELLS_A_NEIGHBOURHOOD)
     below = good & (values < 0.0)
@@ -200,7 +200,7 @@ def _scatter_around(values: NDArray[np.float32], good: BoolArray, side: int) -> 
     return np.asarray(wide[: values.shape[0], : values.shape[1]])
 
 
-def masked_sums(values: NDArray[Any], good: BoolArray, side: int) -> NDArray[np.float32]:
+def masked_sums(values: NDArray[Any], good: BoolArray, side: int) -> Float32Array:
     """Sums over the good pixels of squares, as `square_sums`, in threads."""
     made = np.empty([-(-size // side) for size in good.shape], dtype=np.float32)
 
@@ -223,7 +223,7 @@ def _for_bands(work: Callable[[slice, slice], object], rows: int, side: int) -> 
     run_threaded(one, -(-rows // step))
 
 
-def square_sums(image: NDArray[Any], side: int) -> NDArray[np.float32]:
+def square_sums(image: NDArray[Any], side: int) -> Float32Array:
     """Sums over squares; those at the far edges have fewer pixels."""
     if side == 1:
         return np.asarray(image, dtype=np.float32)

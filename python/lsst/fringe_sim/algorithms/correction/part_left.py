@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import fft2
 
+from ...array_types import BoolArray, Float32Array, FloatArray
 from .objects import square_sums
 from .scales import ScaleFit
 
 __all__ = ["PartLeft", "part_left"]
 
-Window = NDArray[np.float32]
-Sums = tuple[NDArray[np.float64], NDArray[np.float64]]
+Window = Float32Array
+Sums = tuple[FloatArray, FloatArray]
 
 WINDOW_PX, WINDOWS_A_SIDE = 128, 6
 """Side of the windows in which fringes are waves of few directions and lengths; in small frames it is a sixth of the
@@ -54,11 +55,11 @@ class PartLeft:
 
 
 def part_left(
-    residual: NDArray[np.float32],
-    fringes: NDArray[np.float32],
-    used: NDArray[np.bool_],
+    residual: Float32Array,
+    fringes: Float32Array,
+    used: BoolArray,
     fit: ScaleFit,
-    information: NDArray[np.float64],
+    information: FloatArray,
     noise: Sequence[NDArray[Any]] = (),
 ) -> PartLeft:
     """Compare the residual with the fringes that were subtracted.
@@ -101,7 +102,7 @@ def part_left(
     return PartLeft(square + from_scales[0] + printed, variance)
 
 
-def _oriented_power(residual: Window, fringes: Window, used: NDArray[np.bool_]) -> Sums:
+def _oriented_power(residual: Window, fringes: Window, used: BoolArray) -> Sums:
     """Power of residual and of fringes, in each window, at the waves of the fringes less that across them."""
     side = 2 * (min(WINDOW_PX, min(used.shape) // WINDOWS_A_SIDE) // 2)
     residual, fringes = (np.where(used, each, np.float32(0.0)) for each in (residual, fringes))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtr
 
-from ...array_types import BoolArray, FloatArray
+from ...array_types import BoolArray, Float32Array, FloatArray
 from ...compiled import processors, run_threaded
 from ...errors import InputError
 from .objects import FrameFit, find_objects, square_sums
@@ -91,10 +91,7 @@ class FrameProof:
 
 
 def prove(
-    frame: FrameFit,
-    weight: NDArray[np.float32],
-    aperture_px: int,
-    variances: Sequence[NDArray[Any]] = (),
+    frame: FrameFit, weight: Float32Array, aperture_px: int, variances: Sequence[NDArray[Any]] = ()
 ) -> FrameProof:
     """Compare a frame before and after its correction.
 
@@ -157,7 +154,7 @@ def prove(
     )
 
 
-def _scaled_sum(scale: FloatArray, patterns: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+def _scaled_sum(scale: FloatArray, patterns: Sequence[Float32Array]) -> Float32Array:
     total = np.empty_like(patterns[0])
 
     def one(band: int) -> None:
@@ -192,9 +189,7 @@ def _untouched(frame: FrameFit, largest: int) -> FrameProof:
     )  # fmt: skip
 
 
-def _plain_weight(
-    residual: NDArray[np.float32], weight: NDArray[np.float32], sums: FrameSums
-) -> NDArray[np.float32]:
+def _plain_weight(residual: Float32Array, weight: Float32Array, sums: FrameSums) -> Float32Array:
     """Weight without objects and outliers of a frame whose fringes nobody knows."""
     good = weight > 0
     objects = find_objects(residual, good, rounding_of(sums.level))
@@ -212,20 +207,20 @@ class _Apertures:
 
     def __init__(self, good: BoolArray, largest: int) -> None:
         self.good, self.largest = good, largest
-        self.shares: list[NDArray[np.float32]] = []
+        self.shares: list[Float32Array] = []
         share: NDArray[Any] = good
         while 2 << len(self.shares) <= largest:
             self.shares.append(_overlapping(share, 1 << len(self.shares)))
             share = square_sums(share, 2)
         self.last = _of_apertures(good, largest)
 
-    def structure(self, values: NDArray[np.float32], noise: float) -> float:
+    def structure(self, values: Float32Array, noise: float) -> float:
         """Structure beyond the noise [variance of a pixel] in the apertures in which it is largest."""
         return math.sqrt(max(self.power(values) / noise - 1.0, 0.0)) if noise > 0.0 else math.nan
 
-    def power(self, values: NDArray[np.float32]) -> float:
+    def power(self, values: Float32Array) -> float:
         """Largest mean square of means over apertures, as the variance of a pixel of white noise that had it."""
-        total: NDArray[np.float32] = np.where(self.good, values, np.float32(0.0))
+        total: Float32Array = np.where(self.good, values, np.float32(0.0))
         found = [_power(self.last, _of_apertures(total, self.largest), self.largest)]
         for level, share in enumerate(self.shares):
             found.append(_power(share, _overlapping(total, 1 << level), 2 << level))
@@ -307,7 +302,7 @@ def uniform_background_indicator(residual: NDArray[Any], good: BoolArray) -> flo
     return (float(np.std(flux)) + middle / float(disc.sum())) / middle if middle > 0.0 else math.nan
 
 
-def _of_apertures(values: NDArray[Any], side: int) -> NDArray[np.float32]:
+def _of_apertures(values: NDArray[Any], side: int) -> Float32Array:
     """Sums over apertures, which overlap by half where their side is even."""
     half = side // 2 if side % 2 == 0 else side
     # Squares that the edge has cut are no part of apertures.
@@ -316,7 +311,7 @@ def _of_apertures(values: NDArray[Any], side: int) -> NDArray[np.float32]:
     return total if half == side else _overlapping(total, half)
 
 
-def _overlapping(total: NDArray[Any], half: int) -> NDArray[np.float32]:
+def _overlapping(total: NDArray[Any], half: int) -> Float32Array:
     """Apertures of two by two squares; where there are so many that it matters not, without overlap."""
     if half < LEAST_OVERLAPPING:
         return square_sums(total, 2)
@@ -334,9 +329,9 @@ def _pixel_variance(residual: NDArray[Any], good: BoolArray) -> float:
 
 
 def _rises(
-    before: NDArray[np.float32],
-    fringes: NDArray[np.float32],
-    weight: NDArray[np.float32],
+    before: Float32Array,
+    fringes: Float32Array,
+    weight: Float32Array,
     largest: int,
     allowed: Sequence[NDArray[Any]],
     chi2: float,
@@ -361,7 +356,7 @@ def _rises(
     return looks
 
 
-def _rms(values: NDArray[np.float32], good: BoolArray) -> float:
+def _rms(values: Float32Array, good: BoolArray) -> float:
     """Standard deviation of the good pixels."""
     kept, number = np.where(good, values, np.float32(0.0)), max(float(np.count_nonzero(good)), 1.0)
     mean = float(kept.sum(axis=1).sum(dtype=np.float64)) / number

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...array_types import BoolArray, FloatArray
+from ...array_types import BoolArray, Float32Array, FloatArray
 from ...errors import InputError, OutOfRangeError, UndeterminedError
 from .background import SMALLEST_BLOCK_PX, BackgroundTerms
 from .detection import log_evidence
@@ -79,7 +79,7 @@ class ScaleFit:
     scale: FloatArray
     covariance: FloatArray
     coefficient: FloatArray
-    weight: NDArray[np.float32]
+    weight: Float32Array
     chi2_per_pixel: float
     evidence: float
 
@@ -97,7 +97,7 @@ class ScaleFit:
 def fit_scales(
     image: NDArray[Any],
     weight: NDArray[Any],
-    patterns: Sequence[NDArray[np.float32]],
+    patterns: Sequence[Float32Array],
     background: BackgroundTerms,
     *,
     clip_sigma: float = CLIP_SIGMA,
@@ -130,10 +130,10 @@ def fit_scales(
 def settle(
     sums: FrameSums,
     allowed: BoolArray,
-    residual: NDArray[np.float32] | None = None,
+    residual: Float32Array | None = None,
     *,
     clip_sigma: float = CLIP_SIGMA,
-) -> tuple[Solution, NDArray[np.float32]]:
+) -> tuple[Solution, Float32Array]:
     """Fit, leave out pixels that lie off, and repeat until they stay the same.
 
     Parameters
@@ -195,7 +195,7 @@ def coefficient_of(sums: FrameSums, solution: Solution) -> FloatArray:
     return np.asarray(solution.coefficient + sums.level * sums.background.unity())
 
 
-def steady_weight(good: BoolArray, variance: NDArray[Any] | None, image: NDArray[Any]) -> NDArray[np.float32]:
+def steady_weight(good: BoolArray, variance: NDArray[Any] | None, image: NDArray[Any]) -> Float32Array:
     """Inverse variance of the background: 0 in pixels that are not good, steady over cells elsewhere.
 
     A variance that follows the counts of its pixel would give low counts more weight than high ones.
@@ -236,7 +236,7 @@ def steady_weight(good: BoolArray, variance: NDArray[Any] | None, image: NDArray
     return weight
 
 
-def refuse_negative_sky(image: NDArray[Any], weight: NDArray[np.float32]) -> None:
+def refuse_negative_sky(image: NDArray[Any], weight: Float32Array) -> None:
     """Refuse a frame that has been negated: a sky that was subtracted lies within the noise of a pixel of 0.
 
     Raises
@@ -315,7 +315,7 @@ def _roughly_good(sums: FrameSums, allowed: BoolArray) -> BoolArray:
     return good
 
 
-def _kept(sums: FrameSums, allowed: BoolArray, residual: NDArray[np.float32], clip_sigma: float) -> BoolArray:
+def _kept(sums: FrameSums, allowed: BoolArray, residual: Float32Array, clip_sigma: float) -> BoolArray:
     """Pixels that do not lie off; a variance that is wrong by a factor clips as one that is right."""
     most = np.float32((clip_sigma * _spread(sums, residual)) ** 2)
     kept = np.empty(allowed.shape, dtype=bool)
@@ -329,7 +329,7 @@ def _kept(sums: FrameSums, allowed: BoolArray, residual: NDArray[np.float32], cl
     return kept
 
 
-def _spread(sums: FrameSums, residual: NDArray[np.float32]) -> float:
+def _spread(sums: FrameSums, residual: Float32Array) -> float:
     """Scatter of the pulls of a sample of the pixels in use."""
     step = (residual.size // SAMPLE) | 1
     used = sums.used.ravel()[::step]

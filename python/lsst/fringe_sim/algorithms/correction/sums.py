@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from ...array_types import BoolArray, FloatArray
+from ...array_types import BoolArray, Float32Array, FloatArray
 from ...compiled import run_threaded
 from ...errors import UndeterminedError
 from .background import CUBIC, BackgroundTerms
@@ -52,8 +52,8 @@ class FrameSums:
     def __init__(
         self,
         image: NDArray[Any],
-        weight: NDArray[np.float32],
-        patterns: Sequence[NDArray[np.float32]],
+        weight: Float32Array,
+        patterns: Sequence[Float32Array],
         background: BackgroundTerms,
     ) -> None:
         self.weight, self.patterns, self.background = weight, list(patterns), background
@@ -168,11 +168,11 @@ class FrameSums:
         np.add.at(made, (rows[:, None], columns), values)
         return made
 
-    def residual(self, solution: Solution) -> NDArray[np.float32]:
+    def residual(self, solution: Solution) -> Float32Array:
         """Frame less background and templates; 0 where a pixel is never used."""
         left = np.empty(self.image.shape, dtype=np.float32)
 
-        def take(rows: slice, surface: NDArray[np.float32]) -> None:
+        def take(rows: slice, surface: Float32Array) -> None:
             part = np.subtract(self.image[rows], surface, out=left[rows])
             for scale, pattern in zip(solution.scale, self.patterns, strict=False):
                 part -= np.multiply(pattern[rows], np.float32(scale), out=surface)

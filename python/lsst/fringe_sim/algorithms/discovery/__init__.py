@@ -3,15 +3,7 @@
 from ...model.effects_override import read_effects_override
 from .search import SearchOptions, discover
 from .sky_search import SKY_SEARCH, discover_sky, placement_in_frames
-from .verdict import (
-    Gap,
-    NamedEffect,
-    ParameterValue,
-    Step,
-    Verdict,
-    Where,
-    probability_text,
-)
+from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where, probability_text
 
 __all__ = [
     "SKY_SEARCH",

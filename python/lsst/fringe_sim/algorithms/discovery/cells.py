@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...array_types import BoolArray, FloatArray
+from ...blocks import block_sums, in_blocks
 from ...effects import ImageGeometry
 from ...errors import InputError
 from ...products.fringe_cube import FringeCube
@@ -161,10 +162,10 @@ def bin_cube(
     )
     known = sigma = None
     if cube.thickness is not None:
-        known = _block_mean(np.asarray(cube.thickness, dtype=float), cell_px)
+        known = block_sums(np.asarray(cube.thickness, dtype=float), cell_px) / cell_px**2
         weight = np.where(np.isfinite(known), weight, 0.0)
         if cube.thickness_sigma is not None:
-            sigma = _block_mean(np.asarray(cube.thickness_sigma, dtype=float), cell_px)
+            sigma = block_sums(np.asarray(cube.thickness_sigma, dtype=float), cell_px) / cell_px**2
     moved = centroid if centroid.any() else None
     return CellData(value, weight, geometry, cell_px, 0.0, known, sigma, moved)
 
@@ -176,8 +177,7 @@ def _centroid(good: BoolArray, count: FloatArray, cell_px: int) -> FloatArray:
     if not partial.any():
         return result
     within = (np.arange(cell_px) + 0.5) / cell_px - 0.5
-    rows, columns = count.shape
-    blocks = good[: rows * cell_px, : columns * cell_px].reshape(rows, cell_px, columns, cell_px)
+    blocks = in_blocks(good, cell_px)
     for axis, sums in enumerate((blocks.sum(axis=3, dtype=float), blocks.sum(axis=1, dtype=float))):
         first = np.einsum("ypx,p->yx" if axis == 0 else "yxp,p->yx", sums, within)
         np.divide(first, count, out=result[axis], where=partial)
@@ -253,7 +253,7 @@ class _Sums(NamedTuple):
 
     def summed(self, size: int) -> _Sums:
         """Sums over blocks of cells."""
-        return _Sums(*(_block_sum(part, size) for part in self))
+        return _Sums(*(block_sums(part, size) for part in self))
 
     def cells(self, mean: float, cell_px: int) -> tuple[FloatArray, FloatArray]:
         """Values over the mean of the plane, 1 where there are too few pixels, and their weights."""
@@ -279,16 +279,3 @@ def _pixels_of(cube: FringeCube, source: int) -> tuple[_Sums, BoolArray, float]:
         raise InputError(f"mean level at {cube.wavelength_nm[source]:g} nm", mean, "above 0")
     image[~good], variance[~good] = 0.0, 0.0
     return _Sums(good.astype(np.float64), image, variance), good, mean
-
-
-def _block_sum(image: FloatArray, size: int) -> FloatArray:
-    rows, columns = image.shape[0] // size, image.shape[1] // size
-    if size == 1:
-        return image
-    trimmed = image[: rows * size, : columns * size]
-    total: FloatArray = trimmed.reshape(rows, size, columns, size).sum(axis=(1, 3))
-    return total
-
-
-def _block_mean(image: FloatArray, size: int) -> FloatArray:
-    return _block_sum(image, size) / size**2

@@ -46,12 +46,7 @@ def disagreement(
         _strongest_scale(state, cell_px, filled),
         tuple(_by_phase(state, phase)),
         tuple(
-            {
-                "name": c.name,
-                "statistic": c.statistic,
-                "degrees": c.degrees,
-                "probability": c.probability,
-            }
+            {"name": c.name, "statistic": c.statistic, "degrees": c.degrees, "probability": c.probability}
             for c in channels
         ),
     )

@@ -622,10 +622,7 @@ def fit_model(
 
 class _Solver:
     def __init__(
-        self,
-        problem: Problem,
-        coordinates: tuple[Coordinate, ...],
-        fixed: dict[str, float],
+        self, problem: Problem, coordinates: tuple[Coordinate, ...], fixed: dict[str, float]
     ) -> None:
         self.problem, self.coordinates, self.fixed = problem, coordinates, fixed
         self.prior_widths = _prior_widths(coordinates)

@@ -124,11 +124,7 @@ def start_at_step(
 
 
 def followed_on_island(
-    problem: Problem,
-    name: str,
-    settings: Mapping[str, float],
-    thickness_um: FloatArray,
-    level: FloatArray,
+    problem: Problem, name: str, settings: Mapping[str, float], thickness_um: FloatArray, level: FloatArray
 ) -> FloatArray:
     """Thickness moved on the island of a local effect to where the fringes there lie on the data [µm].
 
@@ -299,11 +295,7 @@ class _Compared:
 
 
 def _on_island(
-    problem: Problem,
-    name: str,
-    settings: Mapping[str, float],
-    thickness_um: FloatArray,
-    level: FloatArray,
+    problem: Problem, name: str, settings: Mapping[str, float], thickness_um: FloatArray, level: FloatArray
 ) -> _Compared:
     """How a local effect lies on the data where it is, from some of the cells there."""
     cells, part = problem.cells, problem.forward.coverage(name, settings)
@@ -389,11 +381,7 @@ def _suited_shift(problem: Problem, state: State, name: str, active: Mapping[str
 
 
 def _position(
-    problem: Problem,
-    coordinates: Sequence[Coordinate],
-    size: Coordinate,
-    value: float,
-    disc: Disc,
+    problem: Problem, coordinates: Sequence[Coordinate], size: Coordinate, value: float, disc: Disc
 ) -> FloatArray:
     geometry = problem.cells.geometry
     rows, columns = geometry.cell_px

@@ -17,12 +17,7 @@ from .validation import misfit_rms, thickness_starts
 
 
 def learned_beside(
-    problem: Problem,
-    null: Fit,
-    best: Fit,
-    held_out: BoolArray,
-    rng: np.random.Generator,
-    least: float,
+    problem: Problem, null: Fit, best: Fit, held_out: BoolArray, rng: np.random.Generator, least: float
 ) -> Learned | None:
     """What is learned beside the best fit.
 

@@ -24,10 +24,7 @@ Ranking = Callable[[NamedEffect, Values], tuple[RankedMeasurement, ...]]
 
 
 def with_next_measurements(
-    named: Sequence[NamedEffect],
-    rivals: Mapping[str, Values],
-    rank: Ranking,
-    report: Callable[[str], None],
+    named: Sequence[NamedEffect], rivals: Mapping[str, Values], rank: Ranking, report: Callable[[str], None]
 ) -> tuple[tuple[NamedEffect, ...], tuple[dict[str, Any], ...]]:
     """Effects with the data that would decide between the members of their class, and all that was compared.
 

@@ -9,13 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from ...array_types import BoolArray, FloatArray
-from .comparison import (
-    FEW_CELLS,
-    chi2_with_free_fringes,
-    fringe_order_um,
-    local_minima,
-    sampled_part,
-)
+from .comparison import FEW_CELLS, chi2_with_free_fringes, fringe_order_um, local_minima, sampled_part
 from .fit import Coordinate, Fit, Problem, fit_model
 
 SIZES_TRIED = (0.1, 0.15, 0.23, 0.35, *(0.5 * n for n in range(1, 21)))

@@ -20,8 +20,7 @@ MOST_PLANES = 0.3
 
 NEIGHBOURHOOD = 7  # Side of the area whose median is taken off [cells]; a track covers less than half of it
 
-TILE = 24
-"""Side of the tiles in which the spread is taken [cells]: misfit of the model may be larger in some places."""
+TILE = 24  # Side of the tiles in which the spread is taken [cells]: misfit of the model may be larger in some places
 
 
 def spoiled_cells(residual: FloatArray, used: BoolArray) -> BoolArray:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from ...array_types import BoolArray, FloatArray
+from ...array_types import BoolArray, Float32Array, FloatArray
 from ...compiled import kernel, run_threaded, subkernel
 from ...model import FringeModel
 from .cells import CellData
@@ -86,7 +86,7 @@ def joined_planes(model: FringeModel, cells: CellData, thickness_um: FloatArray)
     return np.asarray(low + SEARCH_STEP_UM * robust_surface(joined, cells.seen, SURFACE_SPACING, order))
 
 
-def _projections(template: FloatArray, cells: CellData) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _projections(template: FloatArray, cells: CellData) -> tuple[Float32Array, Float32Array]:
     """Of every cell on the fringes at all thicknesses, and their squares, an offset of the cell free; ``(N, D)``."""
     waves = cells.shape[0]
     amplitude, weight = (part.reshape(waves, -1).T for part in (cells.value - 1.0, cells.weight))
@@ -163,7 +163,7 @@ class _Blocks:
         return total / weight
 
 
-def _common_move(curves: NDArray[np.float32], height: FloatArray, reach: int) -> float:
+def _common_move(curves: Float32Array, height: FloatArray, reach: int) -> float:
     """Steps by which all planes are moved to where their fringes together lie best on the data."""
     blocks, count = np.arange(len(height)), curves.shape[1]
     places = np.rint(height).astype(np.int64)
@@ -178,11 +178,7 @@ def _common_move(curves: NDArray[np.float32], height: FloatArray, reach: int) ->
 
 @subkernel
 def _gain(
-    cross: NDArray[np.float32],
-    square: NDArray[np.float32],
-    own: NDArray[np.int64],
-    away: NDArray[np.int64],
-    at: int,
+    cross: Float32Array, square: Float32Array, own: NDArray[np.int64], away: NDArray[np.int64], at: int
 ) -> float:  # pragma: no cover - compiled
     """Fall of χ² with a plane on some cells, of one positive contrast."""
     one, two = 0.0, 1e-30
@@ -214,8 +210,8 @@ def _plane(
 
 @kernel
 def _best_plane(
-    cross: NDArray[np.float32],
-    square: NDArray[np.float32],
+    cross: Float32Array,
+    square: Float32Array,
     columns: int,
     top: NDArray[np.int64],
     left: NDArray[np.int64],
@@ -251,13 +247,13 @@ def _best_plane(
 
 @kernel
 def _gains(
-    cross: NDArray[np.float32],
-    square: NDArray[np.float32],
+    cross: Float32Array,
+    square: Float32Array,
     columns: int,
     top: int,
     left: int,
     plane: FloatArray,
-    curve: NDArray[np.float32],
+    curve: Float32Array,
 ) -> None:  # pragma: no cover - compiled
     """Gain of a plane of known slopes at every height."""
     own, away = np.empty(SIDE * SIDE, np.int64), np.empty(SIDE * SIDE, np.int64)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BarycentricInterpolator
 
-from ...array_types import FloatArray
+from ...array_types import Float32Array, FloatArray
 from ...effects import Effect, ImageGeometry, known_effects
 from ...errors import InputError, named_units
 from ...instrument.bandpass import Bandpass
@@ -479,8 +479,8 @@ def _check_components(sky: SkySpectrum, scales: Sequence[Mapping[str, float]]) -
 class _Images(NamedTuple):
     """Frames in electrons, ``(F, ny, nx)``."""
 
-    value: NDArray[np.float32]
-    variance: NDArray[np.float32]
+    value: Float32Array
+    variance: Float32Array
     mask: NDArray[np.int16]
     detector: str
 
@@ -534,7 +534,7 @@ def _as_cube(
     )
 
 
-def _electrons(frame: SkyFringe) -> NDArray[np.float32]:
+def _electrons(frame: SkyFringe) -> Float32Array:
     if frame.unit == "electron":
         return frame.image
     return np.asarray(frame.mean_electrons * (1.0 + frame.image), dtype=np.float32)

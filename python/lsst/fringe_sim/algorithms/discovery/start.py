@@ -11,7 +11,7 @@ from scipy.ndimage import binary_closing, median, median_filter, uniform_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from ...array_types import BoolArray, FloatArray
+from ...array_types import BoolArray, Float32Array, FloatArray
 from ...compiled import contiguous, kernel, run_shares, subkernel
 from ...model import FringeModel
 from .basis import SplineBasis
@@ -218,7 +218,7 @@ def _follow(template: FloatArray, cells: CellData, order: float) -> tuple[NDArra
     return max(((steps, clarity(steps)) for steps in mended), key=lambda item: item[1])
 
 
-def _each_alone(score: NDArray[np.float32], cells: CellData, order: float) -> NDArray[np.int64]:
+def _each_alone(score: Float32Array, cells: CellData, order: float) -> NDArray[np.int64]:
     """Steps of all cells, near a smooth surface through where each by itself is clearest.
 
     Where fringes are less than four cells wide, a field that grows may go down where it should go up; many
@@ -259,7 +259,7 @@ def order_steps(model: FringeModel, cells: CellData) -> float:
     return float(model.fringe_order_um(np.median(cells.wavelength_nm))) / SEARCH_STEP_UM
 
 
-def _correlate(template: FloatArray, cells: CellData) -> NDArray[np.float32]:
+def _correlate(template: FloatArray, cells: CellData) -> Float32Array:
     """Correlation of every cell with the fringes, of the best positive contrast, ``(cells, thickness)``."""
     waves = cells.shape[0]
     amplitude = np.ascontiguousarray((cells.value - 1.0).reshape(waves, -1).T)
@@ -283,7 +283,7 @@ def _correlations(
     square: FloatArray,
     first_cell: int,
     last_cell: int,
-    score: NDArray[np.float32],
+    score: Float32Array,
 ) -> None:  # pragma: no cover - compiled
     """Of cells ``(N, W)`` with fringes ``(W, D)`` and their squares.
 
@@ -313,7 +313,7 @@ def _correlations(
             score[i, d] = max(cross[d], 0.0) / math.sqrt(spread) / root
 
 
-def _common_shift(score: NDArray[np.float32], best: NDArray[np.int64], order: float, count: int) -> int:
+def _common_shift(score: Float32Array, best: NDArray[np.int64], order: float, count: int) -> int:
     """Number of steps by which all cells are moved, a whole number of orders give or take a quarter."""
     reach = int(12 * order)
     totals, inside = _powers_of_shifts(score, np.ascontiguousarray(best), reach)
@@ -323,7 +323,7 @@ def _common_shift(score: NDArray[np.float32], best: NDArray[np.int64], order: fl
 
 @kernel
 def _powers_of_shifts(
-    score: NDArray[np.float32], best: NDArray[np.int64], reach: int
+    score: Float32Array, best: NDArray[np.int64], reach: int
 ) -> tuple[FloatArray, FloatArray]:  # pragma: no cover - compiled
     """Sum of the squared correlations with all cells moved by so many steps, and how many cells have any there."""
     totals, inside = np.zeros(2 * reach + 1), np.zeros(2 * reach + 1)
@@ -335,9 +335,7 @@ def _powers_of_shifts(
     return totals, inside
 
 
-def _mended(
-    score: NDArray[np.float32], best: NDArray[np.int64], cells: CellData, order: float
-) -> NDArray[np.int64]:
+def _mended(score: Float32Array, best: NDArray[np.int64], cells: CellData, order: float) -> NDArray[np.int64]:
     """Steps of all cells, with those in a wrong fringe order taken back in every way that is known."""
     best = _mend_orders(score, best, cells.shape[1:], order)
     best = _mend_patches(score, best, cells.seen, order)
@@ -345,7 +343,7 @@ def _mended(
 
 
 def _mend_orders(
-    score: NDArray[np.float32], best: NDArray[np.int64], shape: tuple[int, int], order: float
+    score: Float32Array, best: NDArray[np.int64], shape: tuple[int, int], order: float
 ) -> NDArray[np.int64]:
     """Move patches that grew across a fringe into the wrong order, if that is likelier or leaves fewer cliffs."""
     if min(shape) < FEWEST_ROWS:
@@ -369,7 +367,7 @@ def _mend_orders(
 
 
 def _mend_patches(
-    score: NDArray[np.float32], best: NDArray[np.int64], seen: BoolArray, order: float
+    score: Float32Array, best: NDArray[np.int64], seen: BoolArray, order: float
 ) -> NDArray[np.int64]:
     """Take back small patches, single cells among them, that stand whole orders off what surrounds them.
 
@@ -414,7 +412,7 @@ def _without_gaps(seen: BoolArray) -> BoolArray:
 
 
 def _mend_by_surface(
-    score: NDArray[np.float32], best: NDArray[np.int64], cells: CellData, order: float
+    score: Float32Array, best: NDArray[np.int64], cells: CellData, order: float
 ) -> NDArray[np.int64]:
     """Take back ragged patches: every cell at its best less than half an order from a smooth surface through most.
 
@@ -433,7 +431,7 @@ def _mend_by_surface(
 
 
 def _near_surface(
-    score: NDArray[np.float32], current: NDArray[np.int64], cells: CellData, spacing: float, order: float
+    score: Float32Array, current: NDArray[np.int64], cells: CellData, spacing: float, order: float
 ) -> tuple[NDArray[np.int64], BoolArray]:
     """Steps with those more than half an order from a smooth surface moved to their best less far from it; which."""
     surface = robust_surface(current.reshape(cells.shape[1:]).astype(float), cells.seen, spacing, order)
@@ -477,7 +475,7 @@ def _turns_of_patches(
     return turns
 
 
-def _nearby_peak(score: NDArray[np.float32], best: NDArray[np.int64], reach: int = 4) -> NDArray[np.int64]:
+def _nearby_peak(score: Float32Array, best: NDArray[np.int64], reach: int = 4) -> NDArray[np.int64]:
     """Best thickness within a few search steps."""
     around = np.clip(best[:, np.newaxis] + np.arange(-reach, reach + 1), 0, score.shape[1] - 1)
     choice = np.argmax(np.take_along_axis(score, around, axis=1), axis=1)
@@ -489,7 +487,7 @@ def _cliffs(field: NDArray[np.int64], order: float) -> int:
     return sum(int((np.abs(np.diff(field, 2, axis=axis)) > 0.6 * order).sum()) for axis in (0, 1))
 
 
-def _grow(score: NDArray[np.float32], rows: int, columns: int, reach: int) -> NDArray[np.int64]:
+def _grow(score: Float32Array, rows: int, columns: int, reach: int) -> NDArray[np.int64]:
     """Follow the best correlation from cell to cell, clearest first."""
     clarity = score.max(axis=1).astype(float)
     # The seed lies inside, where it has neighbours on all sides.
@@ -506,7 +504,7 @@ def _grow(score: NDArray[np.float32], rows: int, columns: int, reach: int) -> ND
 @kernel
 def _grow_from(
     seed: int,
-    score: NDArray[np.float32],
+    score: Float32Array,
     clarity: FloatArray,
     rows: int,
     columns: int,
@@ -546,7 +544,7 @@ def _grow_from(
 
 @subkernel
 def _choose(
-    score: NDArray[np.float32], best: NDArray[np.int64], rows: int, columns: int, i: int, reach: int
+    score: Float32Array, best: NDArray[np.int64], rows: int, columns: int, i: int, reach: int
 ) -> int:  # pragma: no cover - compiled
     """Thickness of a cell: the best correlation near the plane through the grown cells around it."""
     y, x = i // columns, i % columns

@@ -1,4 +1,9 @@
-"""Thickness maps from flats at many wavelengths: a global fit, and the walk of the paper as its peer."""
+"""Thickness maps from flats at many wavelengths: a global fit, and the walk of the paper as its peer.
+
+Inside, ``order_um`` is the thickness of one fringe order [µm], ``range_um`` the thicknesses that are possible [µm],
+and ``temper`` the number of independent cells per cell, or pixels per pixel: below 1 where the noise of neighbours is
+correlated.
+"""
 
 from ..thickness_fit_options import SILICON_FIELDS
 from .amplitudes import Amplitudes
@@ -11,13 +16,13 @@ from .pixels import PixelFit
 from .silicon import find_silicon
 from .silicon_result import SiliconFit, SiliconForecast, SiliconSearch, silicon_map
 from .silicon_tables import SiliconModel
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 __all__ = [
     "FIT_METHODS",
     "SILICON_FIELDS",
     "Amplitudes",
-    "FringeTemplates",
+    "FlatTemplates",
     "GlobalFit",
     "NuisanceFit",
     "Nuisances",

@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...array_types import FloatArray
+from ...array_types import Float32Array, FloatArray
 from ...errors import InputError, OutOfRangeError
 
 
@@ -48,7 +48,7 @@ class Amplitudes:
     bad: NDArray[Any]
     scale: FloatArray
     noise_correlation_px: float = 0.0
-    offset: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 1, 1), np.float32))
+    offset: Float32Array = field(default_factory=lambda: np.zeros((0, 1, 1), np.float32))
     y_edges: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     x_edges: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
@@ -114,7 +114,7 @@ class Amplitudes:
 
     def rows(
         self, start: int, stop: int, wavelengths: slice = slice(None)
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int16]]:
+    ) -> tuple[Float32Array, Float32Array, NDArray[np.int16]]:
         """Image, variance and mask of some rows, in native byte order; without a copy where they are so.
 
         The mask is non-zero where a pixel is not to be used; its bits mean nothing.

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import Float32Array
 from ...compiled import kernel
 from .amplitudes import Amplitudes, core
 from .templates import LANES
@@ -21,7 +22,7 @@ _EVERY = slice(None)
 
 def load_band(
     data: Amplitudes, low: int, high: int, wavelengths: slice = _EVERY
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[Float32Array, Float32Array]:
     """Amplitudes and inverse variances of the rows from ``low`` to ``high``, light divided out.
 
     ``low, high``: first row, and the one after the last; rows beyond the sensor are left out; ``wavelengths``:
@@ -46,7 +47,7 @@ def load_band(
 
 def gather_pixels(
     data: Amplitudes, rows: NDArray[np.intp], columns: NDArray[np.intp]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[Float32Array, Float32Array]:
     """Amplitudes and weights of some pixels, shape ``(n, padded wavelengths)``."""
     wavelengths = data.shape[0]
     padded = -(-wavelengths // LANES) * LANES

@@ -17,7 +17,7 @@ from .cells import Cells
 from .misfit import Misfit, improbability
 from .newton import gauss_newton
 from .pixels import SAME_SURFACE
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 BREAK_PRICE = 8.0  # Chi-square that a break of half an order or more between two neighbouring cells costs
 _SWEEPS = 6
@@ -33,7 +33,7 @@ class Rises:
 
 def join_neighbours(
     cells: Cells,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     thickness_um: NDArray[np.float32],
     rises: Rises,
     order_um: float,

@@ -8,38 +8,36 @@ for every neighbour from which it would be torn off.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...compiled import kernel, subkernel
+from ...array_types import BoolArray, Float32Array
+from ...compiled import kernel
 from .amplitudes import Amplitudes
 from .bands import gather_pixels
+from .between_orders import break_price
 from .misfit import Misfit, improbability
 from .newton import gauss_newton
-from .pixels import PixelFit
-from .templates import FringeTemplates
+from .pixels import SAME_SURFACE, PixelFit
+from .templates import FlatTemplates
 
-_PRICE = 2.0  # Chi-square that a break of half an order or more between two neighbouring pixels costs
+_SHARE_OF_PRICE = 0.25  # A break between two neighbouring pixels costs so much of one between two cells
 _SWEEPS = 6
-_SAME_SURFACE = 0.25
 _MOST_SURFACES = 6
 _MOST_JUDGED = 20_000  # Pixels that show how far all are off
 
 
 def settle_borders(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     pixels: PixelFit,
-    rough: NDArray[np.bool_],
+    rough: BoolArray,
     order_um: float,
     temper: float,
-) -> tuple[PixelFit, NDArray[np.float32]]:
+) -> tuple[PixelFit, Float32Array]:
     """Revise the pixels near steps.
 
-    ``pixels``: what the pixels found by themselves; its arrays are revised in place; ``rough``: pixels that have
-    more than one surface within reach, bool, ``(ny, nx)``; ``order_um``: thickness of one fringe order [µm];
-    ``temper``: independent pixels per pixel: below 1 where the noise is correlated. Returns ``pixels``: the revised
-    fit; ``slip``: probability that a pixel lies on another of the surfaces; 0 where there is only one, float32,
-    ``(ny, nx)``.
+    ``pixels``: what the pixels found by themselves; its arrays are revised in place; ``rough``: pixels that have more
+    than one surface within reach, bool, ``(ny, nx)``. Returns ``pixels``: the revised fit; ``slip``: probability that
+    a pixel lies on another of the surfaces; 0 where there is only one, float32, ``(ny, nx)``.
     """
     slip = np.zeros(rough.shape, np.float32)
     rows, columns = np.nonzero(rough & (pixels.n_wavelengths > 0))
@@ -48,13 +46,12 @@ def settle_borders(
     value, weight = gather_pixels(data, rows, columns)
     freedom = np.maximum(np.count_nonzero(weight > 0, axis=1) - 1, 1).astype(np.float32)
     misfit = _misfit_of(pixels)
-    arguments = (
-        value, weight, freedom, misfit.scale, misfit.tail, rows, columns, templates.table(),
-        templates.start_um, templates.step_um, order_um, temper,
-        pixels.value, pixels.sigma, pixels.chi2, slip,
-    )  # fmt: skip
+    spread, grid = (misfit.scale, misfit.tail), templates.grid()
     for sweep in range(_SWEEPS):
-        if _sweep(*arguments, sweep % 2 == 1) == 0:
+        backwards = sweep % 2 == 1
+        if not _sweep(
+            value, weight, freedom, spread, rows, columns, grid, order_um, temper, pixels, slip, backwards
+        ):
             break
     return pixels, slip
 
@@ -69,18 +66,13 @@ def _misfit_of(pixels: PixelFit) -> Misfit:
     return Misfit.of(freedom * chi2[known].astype(float), freedom)
 
 
-@subkernel(expand=True)
-def _jump_price(jump, order):  # type: ignore[no-untyped-def]
-    share = 2.0 * jump / order
-    return _PRICE * min(share * share, 1.0)
-
-
 @kernel
 def _sweep(  # type: ignore[no-untyped-def]
-    value, weight, freedom, scale, tail, rows, columns, table, start, step, order, temper,
-    thickness, sigma, reduced, slip, backwards,
-):  # fmt: skip
+    value, weight, freedom, misfit, rows, columns, grid, order, temper, pixels, slip, backwards
+):
     """Ask every pixel once; returns how many changed their mind."""
+    (scale, tail), (table, start, step) = misfit, grid
+    thickness, sigma, reduced, _ = pixels
     ny, nx = thickness.shape
     top = table.shape[0] - 1.0
     guess = np.empty(_MOST_SURFACES, np.float64)
@@ -96,33 +88,28 @@ def _sweep(  # type: ignore[no-untyped-def]
                 if np.isfinite(there) and count < _MOST_SURFACES:
                     known = False
                     for g in range(count):
-                        known = known or abs(guess[g] - there) < _SAME_SURFACE * order
+                        known = known or abs(guess[g] - there) < SAME_SURFACE * order
                     if not known:
                         guess[count] = there
                         count += 1
         if count == 1:
             slip[y, x] = 0.0
             continue
-        best, least, best_place, best_information, best_chi2 = (
-            0,
-            np.inf,
-            0.0,
-            np.float32(0.0),
-            np.float32(0.0),
-        )
+        best, least, best_place = 0, np.inf, 0.0
+        best_information, best_chi2 = np.float32(0.0), np.float32(0.0)
         total = 0.0
         for g in range(count):
             place = min(max((guess[g] - start) / step, 0.0), top)
             place, information, chi2 = gauss_newton(table, place, value, weight, k, np.int64(5), 0.03 / step)
             at = start + step * place
-            if g > 0 and abs(at - guess[g]) > _SAME_SURFACE * order:
+            if g > 0 and abs(at - guess[g]) > SAME_SURFACE * order:
                 continue
             # Student's: what a pixel leaves over beyond its noise is error of the model, which chooses no side.
             cost = temper * improbability(chi2, freedom[k], scale, tail)
             for b in range(max(y - 1, 0), min(y + 2, ny)):
                 for a in range(max(x - 1, 0), min(x + 2, nx)):
                     if (b != y or a != x) and np.isfinite(thickness[b, a]):
-                        cost += _jump_price(thickness[b, a] - at, order)
+                        cost += _SHARE_OF_PRICE * break_price(thickness[b, a] - at, order)
             if cost < least:
                 # Keep the sum of the odds relative to the best so far.
                 total = total * np.exp(0.5 * (cost - least)) + 1.0 if least < np.inf else 1.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import Float32Array
 from .amplitudes import Amplitudes
 
 LARGEST_CELL_PX = 8  # Cells beyond this would wash out the steep fringes of real sensors (9 nm per pixel)
@@ -64,7 +65,7 @@ def choose_cell_size(data: Amplitudes) -> int:
 
 def _strip(
     data: Amplitudes, bands: slice, row: int, height: int, every: int = 1
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[Float32Array, Float32Array]:
     """Amplitude and variance of some rows (or every so many of them), NaN where not to be used."""
     image, variance, bad = (part[bands, ::every] for part in data.rows(row, row + height))
     scale = data.scale.astype(np.float32)[bands, None, None]
@@ -76,10 +77,7 @@ def _strip(
 
 
 def _structure(
-    strips: list[NDArray[np.float32]],
-    lag: int,
-    noise: NDArray[np.floating],
-    signal: NDArray[np.floating],
+    strips: list[Float32Array], lag: int, noise: NDArray[np.floating], signal: NDArray[np.floating]
 ) -> float:
     """Ninth decile over blocks of the structure function at one distance."""
     values = []
@@ -101,7 +99,7 @@ def _structure(
     return float(np.percentile(values, 90)) if values else np.inf
 
 
-def _medians(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def _medians(values: Float32Array) -> Float32Array:
     """Median of about a thousand numbers of each row; what is not a number is sorted last, and does not count."""
     some = np.sort(values[:, :: 1 + values.shape[1] // _SAMPLE], axis=1)
     middle = some[np.arange(len(some)), np.isfinite(some).sum(axis=1) // 2]

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...array_types import Float32Array, FloatArray
 from ...compiled import kernel, run_threaded, subkernel
 from ...errors import InputError
 from .amplitudes import Amplitudes
@@ -33,12 +34,12 @@ class Cells:
 
     # value, weight: mean amplitude and its inverse variance; weight 0 where there is none, float32,
     # ``(ncy, ncx, padded wavelengths)``
-    value: NDArray[np.float32]
-    weight: NDArray[np.float32]
+    value: Float32Array
+    weight: Float32Array
     # rise_y, rise_x: slope of the amplitude inside the cell along rows and columns [1/px], from its two halves,
     # float32
-    rise_y: NDArray[np.float32]
-    rise_x: NDArray[np.float32]
+    rise_y: Float32Array
+    rise_x: Float32Array
     # y_edges, x_edges: first row (column) of each cell, and the end of the last
     y_edges: NDArray[np.int64]
     x_edges: NDArray[np.int64]
@@ -54,12 +55,12 @@ class Cells:
         return np.count_nonzero(self.weight > 0, axis=-1)
 
     @property
-    def y_centre(self) -> NDArray[np.float64]:
+    def y_centre(self) -> FloatArray:
         """Row of the centre of each row of cells [px]."""
         return np.asarray(0.5 * (self.y_edges[:-1] + self.y_edges[1:] - 1.0), dtype=float)
 
     @property
-    def x_centre(self) -> NDArray[np.float64]:
+    def x_centre(self) -> FloatArray:
         """Column of the centre of each column of cells [px]."""
         return np.asarray(0.5 * (self.x_edges[:-1] + self.x_edges[1:] - 1.0), dtype=float)
 
@@ -150,17 +151,17 @@ def average_cells(
 
 
 def compensate_slopes(
-    cells: Cells, slope_y: NDArray[np.float32], slope_x: NDArray[np.float32], order_um: float
-) -> tuple[Cells, NDArray[np.float32], NDArray[np.float32]]:
+    cells: Cells, slope_y: Float32Array, slope_x: Float32Array, order_um: float
+) -> tuple[Cells, Float32Array, Float32Array]:
     """Undo the loss of contrast that averaging over a steep cell brings.
 
     A fringe whose phase turns by ``2 pi t`` across a cell keeps ``sin(pi t) / (pi t)`` of its amplitude, in each
     direction; a slope that is taken from the two halves of a cell is too small by this and by the same loss over
     half a cell.
 
-    ``slope_y, slope_x``: slopes of the thickness as found from the halves [µm/px], float32, ``(ncy, ncx)``;
-    ``order_um``: thickness of one fringe order [µm]. Returns ``cells``: the cells with amplitudes divided by
-    the loss, and weights to match; ``slope_y, slope_x``: corrected slopes.
+    ``slope_y, slope_x``: slopes of the thickness as found from the halves [µm/px], float32, ``(ncy, ncx)``. Returns
+    ``cells``: the cells with amplitudes divided by the loss, and weights to match; ``slope_y, slope_x``: corrected
+    slopes.
     """
     turn_y = slope_y * np.diff(cells.y_edges)[:, None] / order_um
     turn_x = slope_x * np.diff(cells.x_edges)[None, :] / order_um

@@ -9,7 +9,7 @@ import numpy as np
 from .learning import learn
 from .learning_cells import LearningCells
 from .nuisances import NuisanceFit, Nuisances
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _MOST_ORDERS = 8
 _CLEAR = 100.0  # Chi-square difference beyond which the orders behind one need not be asked
@@ -29,16 +29,13 @@ class CommonOrder:
 
 def rank_orders(
     cells: LearningCells,
-    base: FringeTemplates,
+    base: FlatTemplates,
     free: Nuisances,
     start: NuisanceFit,
     order_um: float,
     range_um: tuple[float, float],
 ) -> CommonOrder:
-    """Compare the orders of a whole sensor: each with the light, contrast and wavelengths that it needs.
-
-    ``order_um``: thickness of one order [µm]; ``range_um``: thicknesses that are possible [µm].
-    """
+    """Compare the orders of a whole sensor: each with the light, contrast and wavelengths that it needs."""
     thickness, here = learn(cells, base, free, start)
     if not np.isfinite(
         here.chi2
@@ -79,7 +76,7 @@ def rank_orders(
 
 
 def _guess_at_order(
-    cells: LearningCells, base: FringeTemplates, free: Nuisances, start: NuisanceFit, move_um: float
+    cells: LearningCells, base: FlatTemplates, free: Nuisances, start: NuisanceFit, move_um: float
 ) -> tuple[LearningCells, NuisanceFit]:
     """Cells moved by some orders, and the wavelengths at which their fringes look the same there."""
     moved = replace(cells, thickness_um=cells.thickness_um + np.float32(move_um))

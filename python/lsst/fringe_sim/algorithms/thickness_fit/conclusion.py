@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from ...array_types import Float32Array, FloatArray
 from ...products import FlatFit
 from .cells import Cells
 from .nuisances import NuisanceFit
 from .pixels import PixelFit
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 from .wavelengths import spread_of_wavelengths
 
 CERTAIN = 25.0
@@ -31,7 +32,7 @@ _SOME = 512  # Rows and columns of which slopes are taken
 
 
 def model_error(
-    pixels: PixelFit, scale_sigma: float, learned_sigma_um: NDArray[np.float32] | None = None
+    pixels: PixelFit, scale_sigma: float, learned_sigma_um: Float32Array | None = None
 ) -> PixelFit:
     """Uncertainties with the error of the model in them, which chi-square shows, and of what was learned of it.
 
@@ -59,7 +60,7 @@ def model_error(
     return pixels
 
 
-def _block_medians(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+def _block_medians(values: Float32Array) -> tuple[Float32Array, NDArray[np.intp]]:
     """Median of every block, of every second row and column of it, and how many numbers it is of, at least one."""
     side = _BLOCK_PX // 2
     some = values[::2, ::2]
@@ -74,9 +75,7 @@ def _block_medians(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], ND
     return np.where(np.isfinite(middle), middle, np.float32(0)), count
 
 
-def contrast_map(
-    cells: Cells, templates: FringeTemplates, thickness_um: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def contrast_map(cells: Cells, templates: FlatTemplates, thickness_um: Float32Array) -> Float32Array:
     """Contrast in blocks of cells over that of the templates, the thickness of each cell being free.
 
     ``thickness_um``: thickness of the cells [µm], float32, ``(ncy, ncx)``.
@@ -103,7 +102,7 @@ def contrast_map(
     return out
 
 
-def flat_fit(nuisance: NuisanceFit, wavelength_nm: NDArray[np.float64]) -> FlatFit:
+def flat_fit(nuisance: NuisanceFit, wavelength_nm: FloatArray) -> FlatFit:
     """Numbers of each flat for a product."""
     misfit = nuisance.misfit if nuisance.misfit.size else np.ones(wavelength_nm.size)
     return FlatFit(
@@ -140,7 +139,7 @@ def cards(flats: FlatFit, margin: float, scale_sigma: float) -> dict[str, Any]:
     return found
 
 
-def slope_cards(thickness_um: NDArray[np.float32], order_um: float) -> dict[str, float]:
+def slope_cards(thickness_um: Float32Array, order_um: float) -> dict[str, float]:
     """Header keywords: orders from one pixel to the next, and the contrast that is left of fringes so dense.
 
     A pixel averages the fringes over what the thickness changes within it, which the model does not: it has one

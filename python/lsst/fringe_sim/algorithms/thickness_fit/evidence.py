@@ -7,16 +7,16 @@ first, unless what they find there fits badly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
+from ...array_types import Float32Array, FloatArray
 from ...compiled import kernel, run_threaded, subkernel
 from .cells import Cells
 from .newton import gauss_newton
-from .templates import FringeTemplates, arc_length_nodes
+from .templates import FlatTemplates, arc_length_nodes
 
 NODES_PER_ORDER = 16
 """Templates in one fringe order: the least chi-square from a parabola is then good to 2e-4 of its swing."""
@@ -31,40 +31,47 @@ _STRIDE = 4  # One cell in so many, in both directions, is compared with the who
 _MARGIN_ORDERS = 3  # Orders that the others look beyond what the first cells showed to be needed
 
 
-@dataclass(frozen=True, eq=False)
-class OrderEvidence:
+class OrderEvidence(NamedTuple):
     """What each cell says about its own thickness."""
 
     # thickness of the best template moved by whole orders into the first order of the range [µm]; NaN where a cell
     # has no data, float32, ``(ncy, ncx)``
-    phase_um: NDArray[np.float32]
+    phase_um: Float32Array
     # slope_y, slope_x: slope of the thickness inside the cells, mean of 3 by 3 cells; the same for every order
     # [µm/px], float32, ``(ncy, ncx)``
-    slope_y: NDArray[np.float32]
-    slope_x: NDArray[np.float32]
-    best_um: NDArray[np.float32]  # thickness of the best template by itself [µm], float32, ``(ncy, ncx)``
-    chi2: NDArray[np.float32]  # its chi-square, float32, ``(ncy, ncx)``
+    slope_y: Float32Array
+    slope_x: Float32Array
+    best_um: Float32Array  # thickness of the best template by itself [µm], float32, ``(ncy, ncx)``
+    chi2: Float32Array  # its chi-square, float32, ``(ncy, ncx)``
     # chi-square of each order ``phase + m * order`` above that of the best, scaled down where the best itself fits
     # badly and where the noise of neighbouring cells is correlated; at most `EVIDENCE_CAP`, float32,
     # ``(ncy, ncx, n_orders)``
-    evidence: NDArray[np.float32]
+    evidence: Float32Array
     order_um: float  # thickness of one order [µm]
+
+    def part(self, where: int | tuple[slice, slice]) -> OrderEvidence:
+        """Views of some cells."""
+        phase, slope_y, slope_x, best, chi2, evidence = (each[where] for each in self[:-1])
+        return OrderEvidence(phase, slope_y, slope_x, best, chi2, evidence, self.order_um)
+
+
+class _Nodes(NamedTuple):
+    """Thicknesses at which cells are compared with templates."""
+
+    amplitude: Float32Array  # ``(n_wavelengths, n_nodes)``
+    place: FloatArray  # ascending [µm], ``(n_nodes,)``
 
 
 def order_evidence(
     cells: Cells,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     order_um: float,
     *,
     range_um: tuple[float, float],
     temper: float = 1.0,
     threads: int = 2,
 ) -> OrderEvidence:
-    """Compare every cell with templates over the whole range.
-
-    ``order_um``: thickness of one fringe order [µm]; ``range_um``: thicknesses that are possible [µm]; ``temper``:
-    independent cells per cell: below 1 where the noise of neighbouring cells is correlated.
-    """
+    """Compare every cell with templates over the whole range."""
     low = max(round((range_um[0] - templates.start_um) / templates.step_um), 0)
     high = min(round((range_um[1] - templates.start_um) / templates.step_um), len(templates.response) - 1)
     amplitude = templates.amplitude()[low : high + 1]
@@ -73,33 +80,28 @@ def order_evidence(
     if not np.any(typical > 0):
         typical = np.ones_like(typical)
     rows = arc_length_nodes(amplitude, typical, int(NODES_PER_ORDER * span / order_um) + 2)
-    nodes = np.ascontiguousarray(amplitude[rows].T.astype(np.float32))
-    place = (templates.start_um + templates.step_um * (low + rows)).astype(np.float64)
+    nodes = _Nodes(
+        np.ascontiguousarray(amplitude[rows].T.astype(np.float32)),
+        (templates.start_um + templates.step_um * (low + rows)).astype(np.float64),
+    )
     orders = int(np.floor(span / order_um)) + 1
     shape = cells.shape
     phase, slope_y, slope_x, best, chi2 = (np.full(shape, np.nan, np.float32) for _ in range(5))
-    table = templates.table()
     evidence = np.zeros((*shape, orders), np.float32)
+    found = OrderEvidence(phase, slope_y, slope_x, best, chi2, evidence, order_um)
+    grid = templates.grid()
 
-    def ask(row: int, step: int, centre: NDArray[np.float32], reach: int, limit: float) -> None:
-        _evidence_row(
-            cells.value[row], cells.weight[row], cells.rise_y[row], cells.rise_x[row],
-            nodes, place, table, templates.start_um, templates.step_um, order_um, temper,
-            step, centre, reach, limit,
-            phase[row], slope_y[row], slope_x[row], best[row], chi2[row], evidence[row],
-        )  # fmt: skip
+    def ask(row: int, step: int, centre: Float32Array, reach: int, limit: float) -> None:
+        own, rises = (cells.value[row], cells.weight[row]), (cells.rise_y[row], cells.rise_x[row])
+        _evidence_row(*own, rises, nodes, grid, temper, step, centre, reach, limit, found.part(row))
 
     nowhere = np.full(shape[1], np.nan, np.float32)
     first = range(0, shape[0], _STRIDE)
     run_threaded(lambda item: ask(first[item], _STRIDE, nowhere, orders, np.inf), len(first), threads)
-    known = best[::_STRIDE, ::_STRIDE]
-    reach, limit = _needed_reach(
-        known,
-        phase[::_STRIDE, ::_STRIDE],
-        chi2[::_STRIDE, ::_STRIDE],
-        evidence[::_STRIDE, ::_STRIDE],
-        order_um,
-    )
+    every = slice(None, None, _STRIDE)
+    some = found.part((every, every))
+    known = some.best_um
+    reach, limit = _needed_reach(some)
     nearest = np.clip((np.arange(shape[1]) + _STRIDE // 2) // _STRIDE, 0, known.shape[1] - 1)
 
     def follow(row: int) -> None:
@@ -107,18 +109,13 @@ def order_evidence(
         ask(row, 1, around, reach, limit)
 
     run_threaded(follow, shape[0], threads)
-    _distrust_misfits(evidence, chi2)
-    return OrderEvidence(phase, _smooth(slope_y), _smooth(slope_x), best, chi2, evidence, order_um)
+    _distrust_misfits(found.evidence, found.chi2)
+    return found._replace(slope_y=_smooth(found.slope_y), slope_x=_smooth(found.slope_x))
 
 
-def _needed_reach(
-    best: NDArray[np.float32],
-    phase: NDArray[np.float32],
-    chi2: NDArray[np.float32],
-    evidence: NDArray[np.float32],
-    order: float,
-) -> tuple[int, float]:
+def _needed_reach(found: OrderEvidence) -> tuple[int, float]:
     """Orders from the best beyond which nothing competes, and the chi-square above which a cell must look again."""
+    phase, _, _, best, chi2, evidence, order = found
     seen = np.isfinite(best)
     if not seen.any():
         return evidence.shape[-1], np.inf
@@ -130,7 +127,7 @@ def _needed_reach(
     return int(np.percentile(farthest, 99.9)) + _MARGIN_ORDERS, limit
 
 
-def _distrust_misfits(evidence: NDArray[np.float32], chi2: NDArray[np.float32]) -> None:
+def _distrust_misfits(evidence: Float32Array, chi2: Float32Array) -> None:
     """Take evidence from cells that fit worse than most: what spoils them favours some order by chance.
 
     Steep cells lose contrast, cells across a step are mixtures, and their neighbours err the same way.
@@ -203,8 +200,9 @@ def _minima(place, chi2, marks, where, depth):  # type: ignore[no-untyped-def]
 
 
 @subkernel
-def _polish(table, start, step, value, weight, item, slack, where, depth, number):  # type: ignore[no-untyped-def]
+def _polish(grid, value, weight, item, slack, where, depth, number):  # type: ignore[no-untyped-def]
     """Refine the deepest minima on the full table; returns the deepest of them."""
+    table, start, step = grid
     done = np.zeros(number, np.bool_)
     best = -1
     for _ in range(min(_POLISHED, number)):
@@ -238,19 +236,17 @@ def _project(table, place, rise, weight, item):  # type: ignore[no-untyped-def]
 
 
 @subkernel
-def _search(value, weight, item, nodes, place, table, start, step, low, high, chi2, marks, where, depth):  # type: ignore[no-untyped-def]
+def _search(value, weight, item, nodes, grid, low, high, chi2, marks, where, depth):  # type: ignore[no-untyped-def]
     """Minima between two nodes; returns the wavelengths used, the number of minima and the deepest of them."""
     part = chi2[: high - low]
-    used = _chi2_line(value[item], weight[item], nodes[:, low:high], part)
+    used = _chi2_line(value[item], weight[item], nodes.amplitude[:, low:high], part)
     if used == 0:
         return 0, 0, -1
-    number = _minima(place[low:high], part, marks, where, depth)
+    number = _minima(nodes.place[low:high], part, marks, where, depth)
     swing = 0.0
     for k in range(0, high - low, 4):
         swing = max(swing, part[k])
-    at = _polish(
-        table, start, step, value, weight, item, _POLISH_SHARE * swing + EVIDENCE_CAP, where, depth, number
-    )
+    at = _polish(grid, value, weight, item, _POLISH_SHARE * swing + EVIDENCE_CAP, where, depth, number)
     return used, number, at
 
 
@@ -268,16 +264,14 @@ def _first_from(place, least):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _evidence_row(  # type: ignore[no-untyped-def]
-    value, weight, rise_y, rise_x, nodes, place, table, start, step, order, temper,
-    stride, centre, reach, limit,
-    phase, slope_y, slope_x, best, chi2_out, evidence,
-):  # fmt: skip
+def _evidence_row(value, weight, rises, nodes, grid, temper, stride, centre, reach, limit, found):  # type: ignore[no-untyped-def]
     """Ask every ``stride``-th cell of a row that has not been asked.
 
     Where ``centre`` is a number, a cell looks no farther than ``reach`` orders from it, unless its chi-square
     there is above ``limit`` or its best order is the last it looked at.
     """
+    place, (table, start, step) = nodes.place, grid
+    phase, slope_y, slope_x, best, chi2_out, evidence, order = found
     count = place.shape[0]
     orders = evidence.shape[1]
     last = place[count - 1] + 0.05 * order
@@ -294,9 +288,7 @@ def _evidence_row(  # type: ignore[no-untyped-def]
             low = max(min(low, count - 2), 0)  # type: ignore[arg-type]
             high = min(high, count)
         while True:  # of one call the code is there once
-            used, number, at = _search(
-                value, weight, c, nodes, place, table, start, step, low, high, chi2, marks, where, depth
-            )
+            used, number, at = _search(value, weight, c, nodes, grid, low, high, chi2, marks, where, depth)
             if used == 0 or high - low == count:
                 break
             near_end = min(where[at] - place[low], place[high - 1] - where[at]) < order
@@ -318,11 +310,11 @@ def _evidence_row(  # type: ignore[no-untyped-def]
         phase[c] = first
         best[c] = thickness
         chi2_out[c] = least
-        slope_y[c] = step * _project(table, (thickness - start) / step, rise_y, weight, c)
-        slope_x[c] = step * _project(table, (thickness - start) / step, rise_x, weight, c)
+        slope_y[c] = step * _project(table, (thickness - start) / step, rises[0], weight, c)
+        slope_x[c] = step * _project(table, (thickness - start) / step, rises[1], weight, c)
 
 
-def _smooth(slope: NDArray[np.float32]) -> NDArray[np.float32]:
+def _smooth(slope: Float32Array) -> Float32Array:
     """Mean over 3 by 3 cells, leaving out those without a value: a slope inside one cell is noisy."""
     good = np.isfinite(slope)
     total = uniform_filter(np.where(good, slope, 0.0).astype(float), 3, mode="constant")
@@ -331,21 +323,18 @@ def _smooth(slope: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def refine_cells(
-    cells: Cells, templates: FringeTemplates, thickness_um: NDArray[np.float32], threads: int = 2
-) -> NDArray[np.float32]:
+    cells: Cells, templates: FlatTemplates, thickness_um: Float32Array, threads: int = 2
+) -> Float32Array:
     """Least chi-square of every cell near a given thickness; NaN stays NaN.
 
     ``thickness_um``: where to begin [µm], float32, ``(ncy, ncx)``.
     """
-    table = templates.table()
+    grid = templates.grid()
     out = np.full(cells.shape, np.nan, np.float32)
     start = np.ascontiguousarray(thickness_um, np.float32)
 
     def work(row: int) -> None:
-        refine_row(
-            cells.value[row], cells.weight[row], table, templates.start_um, templates.step_um,
-            start[row], out[row],
-        )  # fmt: skip
+        refine_row(cells.value[row], cells.weight[row], *grid, start[row], out[row])
 
     run_threaded(work, cells.shape[0], threads)
     return out

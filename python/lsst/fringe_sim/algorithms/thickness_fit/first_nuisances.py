@@ -14,16 +14,14 @@ from ...array_types import FloatArray
 from .cells import Cells
 from .learning_cells import some_of
 from .nuisances import NuisanceFit, Nuisances, light_widths, patterns_of_cells
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _FIRST_CELLS = 20_000
 _INDEPENDENT = 100
 """Independent places of a sensor at most, before the fringes are known: they hide light of their own scale."""
 
 
-def first_nuisances(
-    cells: Cells, templates: FringeTemplates, free: Nuisances, own: bool = True
-) -> NuisanceFit:
+def first_nuisances(cells: Cells, templates: FlatTemplates, free: Nuisances, own: bool = True) -> NuisanceFit:
     """Light and contrast before any thickness is known: fringes average out over wavelengths and over the sensor.
 
     ``own``: whether each wavelength has light of its own, which fringes of few orders are taken for.

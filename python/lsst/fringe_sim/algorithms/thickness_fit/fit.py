@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import Float32Array, FloatArray
 from ...compiled import kernel, one_blas_thread, processors, run_threaded
 from ...errors import InputError, OutOfRangeError, UnknownNameError, named_units
 from ...model import FringeModel
@@ -29,7 +29,7 @@ from .pixels import PixelFit
 from .rescue import chi2_limits, typical_misfit
 from .silicon_result import SiliconSearch
 from .silicon_tables import SiliconModel
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 from .uncertainty import lone_slip_probability, slip_probability
 
 STEPS_PER_ORDER = 300
@@ -134,7 +134,7 @@ def fit_thickness(
     free = nuisances or Nuisances.automatic(contrast, model.setup.wavelength_accuracy_nm)
     free = replace(free, grid=model.setup.amplifier_grid)
     flats: FlatFit | None = None
-    coarse: NDArray[np.float32] | None = None
+    coarse: Float32Array | None = None
     notes: dict[str, Any] = {"METHOD": method, "RANGELO": low, "RANGEHI": high}
     notes["OBSERVAB"] = observable or model.base_system.observable
     if method == "guo2022":
@@ -158,12 +158,7 @@ def fit_thickness(
         notes |= {"ORDERUM": round(joint.found.order_um, 6), **joint.silicon.cards()}
     else:
         found = global_fit(
-            data,
-            templates,
-            range_um=(low, high),
-            cell_px=cell_px,
-            nuisances=free,
-            threads=workers,
+            data, templates, range_um=(low, high), cell_px=cell_px, nuisances=free, threads=workers
         )
         pixels = found.pixels
         slip = slip_probability(found, out=found.border_slip)
@@ -201,10 +196,10 @@ def amplitudes_from_cube(cube: FringeCube, noise_correlation_px: float | None = 
 
 def make_templates(
     model: FringeModel,
-    wavelength_nm: NDArray[np.float64],
+    wavelength_nm: FloatArray,
     range_um: tuple[float, float],
     observable: str | None = None,
-) -> FringeTemplates:
+) -> FlatTemplates:
     """Templates of a model over a range of thickness, with a margin of one order on both sides.
 
     Parameters
@@ -243,17 +238,17 @@ def make_templates(
     ]
     group = 1.0 - wavelength_nm * (near.real - index.real) / index.real
     beside = _turn_beside(model, wavelength_nm, response, group, (start, step))
-    return FringeTemplates(response, start, step, wavelength_nm, group=group, beside_um=beside)
+    return FlatTemplates(response, start, step, wavelength_nm, group=group, beside_um=beside)
 
 
 def _turn_beside(
     model: FringeModel,
-    wavelength_nm: NDArray[np.float64],
-    response: NDArray[np.float64],
-    group: NDArray[np.float64],
+    wavelength_nm: FloatArray,
+    response: FloatArray,
+    group: FloatArray,
     grid_um: tuple[float, float],
-) -> NDArray[np.float64]:
-    """What the thin layers beside the varying one add to how its fringe turns, as `FringeTemplates` takes it.
+) -> FloatArray:
+    """What the thin layers beside the varying one add to how its fringe turns, as `FlatTemplates` takes it.
 
     The derivative of the response in wavelength is that in thickness times a straight line in thickness, whose slope
     is the group index, and a change of level and swing.
@@ -288,11 +283,11 @@ def with_observable(model: FringeModel, observable: str) -> FringeModel:
 
 def _repeated_walk(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     start: tuple[int, int],
     range_um: tuple[float, float],
     threads: int,
-) -> tuple[PixelFit, FringeTemplates]:
+) -> tuple[PixelFit, FlatTemplates]:
     """Walk twice: the mean response over the sensor is known after the first time."""
     first = walk_fit(data, templates, start_pixel=start, range_um=range_um, threads=threads)
     sample = sample_pixels(data)
@@ -305,7 +300,7 @@ def _repeated_walk(
 
 def _assemble(
     pixels: PixelFit,
-    slip: NDArray[np.float32],
+    slip: Float32Array,
     slip_limit: float,
     cube: FringeCube,
     layer: str,

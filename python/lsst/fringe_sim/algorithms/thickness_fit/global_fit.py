@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import Float32Array
 from .amplitudes import Amplitudes
 from .borders import settle_borders
 from .cell_size import choose_cell_size
@@ -21,7 +22,7 @@ from .relaxation import SettledCells, settle_orders
 from .rescue import rescue_pixels
 from .shared_misfit import doubt_from_shared_misfit
 from .solver import Solver, surface_of
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 from .weak_pixels import settle_weak_pixels
 
 
@@ -34,8 +35,8 @@ class GlobalFit:
     settled: SettledCells  # order of every cell, and how sure it is
     # probability that a pixel near a step lies on the other side of it, or that one which was fitted by itself has
     # another order, float32, ``(ny, nx)``
-    border_slip: NDArray[np.float32]
-    templates: FringeTemplates  # the model as it was normalised in the end
+    border_slip: Float32Array
+    templates: FlatTemplates  # the model as it was normalised in the end
     nuisance: NuisanceFit  # patterns and contrast beside the fringes
     order_um: float  # thickness of one fringe order [µm]
     # ``sensor``, ``narrow`` or ``range``: over which thicknesses the mean response was taken. ``narrow`` is a
@@ -45,12 +46,12 @@ class GlobalFit:
     # chi-square by which the next best order of the whole sensor is worse, where nuisances are free
     margin: float = np.inf
     # contrast in blocks of the sensor, over that of the sensor, float32
-    contrast_map: NDArray[np.float32] = field(default_factory=lambda: np.ones((1, 1), np.float32))
+    contrast_map: Float32Array = field(default_factory=lambda: np.ones((1, 1), np.float32))
 
 
 def global_fit(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     *,
     range_um: tuple[float, float],
     cell_px: int | None = None,
@@ -101,12 +102,12 @@ def global_fit(
     pixels = rescue_pixels(
         fringes, state.templates, pixels, border_slip, order, range_um=state.range_um, threads=threads
     )
-    seen = replace(calmed, sigma_um=surface.sigma_um)
+    seen = calmed._replace(sigma_um=surface.sigma_um)
     learned = learned_sigma(cells, seen, leaning, templates, state.free, state.nuisance, order)
     pixels = model_error(pixels, state.nuisance.scale_sigma, learned)
     if state.common_sigma_um > 0.0:
         whole = np.hypot(pixels.sigma, np.float32(state.common_sigma_um))
-        pixels = replace(pixels, sigma=np.asarray(whole, np.float32))
+        pixels = pixels._replace(sigma=np.asarray(whole, np.float32))
     common_slip = state.common_slip
     if state.searched and not state.free.any:
         doubt = doubt_from_shared_misfit(fringes, state.templates, pixels.value, order)

@@ -15,12 +15,12 @@ from ...compiled import kernel, run_threaded, subkernel
 from ...errors import InputError, OutOfRangeError
 from .amplitudes import Amplitudes
 from .pixels import PixelFit
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 
 def walk_fit(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     *,
     start_pixel: tuple[int, int],
     range_um: tuple[float, float],
@@ -46,25 +46,22 @@ def walk_fit(
     if not 0 <= low < high < len(templates.response):
         allowed = f"inside {templates.start_um:g} to {templates.stop_um:g}"
         raise OutOfRangeError("search range [um]", range_um, allowed)
-    image, variance, bad = data.rows(0, ny)
+    flats = (*data.rows(0, ny), data.scale.astype(np.float32))
     table = np.ascontiguousarray(templates.amplitude().T.astype(np.float32))
-    scale = data.scale.astype(np.float32)
     forward, backward = _paths(ny, nx, row, column)
-    seed = _seed(image, variance, bad, scale, table, forward, backward, low, high)
+    seed = _seed(flats, table, forward, backward, low, high)
     if seed < 0:
         raise InputError("pixels", "all masked", "at least one good pixel")
     half = max(round(0.5 * window_um / templates.step_um), 1)
     value, sigma, chi2 = (np.full((ny, nx), np.nan, np.float32) for _ in range(3))
-    used = np.zeros((ny, nx), np.int32)
+    found = PixelFit(value, sigma, chi2, np.zeros((ny, nx), np.int32))
 
     def work(path: int) -> None:
-        _walk(
-            image, variance, bad, scale, table, (forward, backward)[path], seed, half,
-            templates.start_um, templates.step_um, value, sigma, chi2, used,
-        )  # fmt: skip
+        way = (forward, backward)[path]
+        _walk(flats, table, way, seed, half, templates.start_um, templates.step_um, found)
 
     run_threaded(work, 2, threads)
-    return PixelFit(value, sigma, chi2, used)
+    return found
 
 
 def _paths(ny: int, nx: int, row: int, column: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -77,8 +74,9 @@ def _paths(ny: int, nx: int, row: int, column: int) -> tuple[NDArray[np.int64], 
 
 
 @subkernel(relaxed=True)
-def _load(image, variance, bad, scale, y, x, value, weight):  # type: ignore[no-untyped-def]
+def _load(flats, y, x, value, weight):  # type: ignore[no-untyped-def]
     """Amplitudes and weights of one pixel; returns the number of wavelengths that can be used."""
+    image, variance, bad, scale = flats
     used = 0
     for band in range(image.shape[0]):
         amplitude = image[band, y, x] * scale[band] - np.float32(1.0)
@@ -124,32 +122,31 @@ def _next_pixel(y, x, dy, dx, ny):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _seed(image, variance, bad, scale, table, forward, backward, low, high):  # type: ignore[no-untyped-def]
+def _seed(flats, table, forward, backward, low, high):  # type: ignore[no-untyped-def]
     """Row of the template that fits the first good pixel best, anywhere in the range; -1 if none is good."""
-    bands, ny = image.shape[0], image.shape[1]
+    bands, ny = flats[0].shape[0], flats[0].shape[1]
     value, weight = np.empty(bands, np.float32), np.empty(bands, np.float32)
     chi2 = np.empty(high - low + 1, np.float32)
     for path in (forward, backward):
         y, x, dy, dx = path[0], path[1], path[2], path[3]
         for _ in range(path[4]):
-            if _load(image, variance, bad, scale, y, x, value, weight) > 0:
+            if _load(flats, y, x, value, weight) > 0:
                 return _search(table, value, weight, low, high, chi2)[0]
             y, x, dy = _next_pixel(y, x, dy, dx, ny)
     return -1
 
 
 @kernel(relaxed=True)
-def _walk(  # type: ignore[no-untyped-def]
-    image, variance, bad, scale, table, path, seed, half, start, step, thickness, sigma, reduced, used
-):
-    bands, ny = image.shape[0], image.shape[1]
+def _walk(flats, table, path, seed, half, start, step, found):  # type: ignore[no-untyped-def]
+    thickness, sigma, reduced, used = found
+    bands, ny = flats[0].shape[0], flats[0].shape[1]
     rows = table.shape[1]
     value, weight = np.empty(bands, np.float32), np.empty(bands, np.float32)
     chi2 = np.empty(2 * half + 1, np.float32)
     y, x, dy, dx = path[0], path[1], path[2], path[3]
     reference = seed
     for _ in range(path[4]):
-        count = _load(image, variance, bad, scale, y, x, value, weight)
+        count = _load(flats, y, x, value, weight)
         if count > 0:
             low, high = max(reference - half, 0), min(reference + half, rows - 1)
             reference, least = _search(table, value, weight, low, high, chi2)

@@ -16,8 +16,7 @@ from ...products import FringeCube, ThicknessMap, mask_bits
 from ..parabola import parabolic_minimum
 from .rescue import chi2_limits
 
-WIDE = 1.6
-"""Fringe orders on both sides in which pixels are looked for at first; strong voids break the first fit."""
+WIDE = 1.6  # Fringe orders on both sides in which pixels are looked for at first; strong voids break the first fit
 
 NEIGHBOURS = 3  # Rows and columns on both sides of a pixel whose median is where it is looked for
 

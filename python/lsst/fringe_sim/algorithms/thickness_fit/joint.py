@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...array_types import FloatArray
+from ...array_types import Float32Array, FloatArray
 from ...compiled import kernel, run_threaded, subkernel
 from .amplitudes import Amplitudes
 from .bands import BAND_ROWS, gather_pixels, load_band
@@ -19,7 +18,7 @@ from .rescue import typical_misfit
 from .silicon import STEPS_PER_SILICON_ORDER, find_silicon
 from .silicon_result import SiliconFit, SiliconForecast, SiliconSearch
 from .silicon_tables import SiliconModel, SiliconTables, silicon_free
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 from .uncertainty import slip_probability
 
 _STEPS = 3
@@ -34,14 +33,14 @@ class JointFit:
     """Adhesive of every pixel, and silicon of the sensor."""
 
     pixels: PixelFit  # the adhesive. Its uncertainty contains that of the silicon
-    slip: NDArray[np.float32]  # probability that the order of a pixel is wrong, float32, ``(ny, nx)``
+    slip: Float32Array  # probability that the order of a pixel is wrong, float32, ``(ny, nx)``
     silicon: SiliconFit  # the silicon. If it is not decided, its fringes counted as noise of the flats
     found: GlobalFit  # the fit in which the orders of the adhesive were solved
 
 
 def joint_fit(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     model: SiliconModel,
     search: SiliconSearch,
     *,
@@ -87,19 +86,14 @@ def _unknown(search: SiliconSearch, wavelengths: int) -> SiliconFit:
     return SiliconFit(search, np.zeros(terms), np.zeros((terms, terms)), 0.0, 1.0, forecast)
 
 
-def _believed(pixels: PixelFit, slip: NDArray[np.float32]) -> NDArray[np.float32]:
+def _believed(pixels: PixelFit, slip: Float32Array) -> Float32Array:
     """Thickness where the order is sure; NaN elsewhere."""
     good = (slip < _SURE) & np.isfinite(pixels.value) & np.isfinite(pixels.sigma)
     return np.where(good, pixels.value, np.float32(np.nan))
 
 
 def _fit_pixels(
-    data: Amplitudes,
-    model: SiliconModel,
-    silicon: SiliconFit,
-    start: PixelFit,
-    order_um: float,
-    threads: int,
+    data: Amplitudes, model: SiliconModel, silicon: SiliconFit, start: PixelFit, order_um: float, threads: int
 ) -> PixelFit:
     """Adhesive of every pixel at the silicon of its place."""
     shape = start.value.shape
@@ -114,22 +108,20 @@ def _fit_pixels(
     mean = _mean_response(data, tables, start, offset).astype(np.float32)
     padded = np.ones(tables.response.shape[2], np.float32)
     padded[: mean.size] = mean
-    value, spread, chi2 = start.value.copy(), start.sigma.copy(), start.chi2.copy()
+    found = PixelFit(start.value.copy(), start.sigma.copy(), start.chi2.copy(), start.n_wavelengths)
 
     def work(band: int) -> None:
         rows = slice(band * BAND_ROWS, (band + 1) * BAND_ROWS)
-        _joint_band(
-            *load_band(data, rows.start, rows.stop), tables.response, padded, tables.silicon_start_um,
-            tables.silicon_step_um, tables.start_um, tables.step_um, order_um, offset[rows], sigma[rows],
-            start.n_wavelengths[rows], value[rows], spread[rows], chi2[rows],
-        )  # fmt: skip
+        amplitude, weight = load_band(data, rows.start, rows.stop)
+        place = (offset[rows], sigma[rows])
+        _joint_band(amplitude, weight, tables, padded, order_um, *place, found.rows(rows))
 
     run_threaded(work, -(-shape[0] // BAND_ROWS), threads)
-    return PixelFit(value, spread, chi2, start.n_wavelengths)
+    return found
 
 
 def _mean_response(
-    data: Amplitudes, tables: SiliconTables, start: PixelFit, offset: NDArray[np.float32]
+    data: Amplitudes, tables: SiliconTables, start: PixelFit, offset: Float32Array
 ) -> FloatArray:
     """Response by which a flat over its mean is to be multiplied: means of model and flat over the same pixels."""
     ny, nx = start.value.shape
@@ -146,11 +138,10 @@ def _mean_response(
 
 
 @kernel
-def _joint_band(  # type: ignore[no-untyped-def]
-    amplitude, inverse, tables, mean, silicon_start, silicon_step, start, step, order, offset, sigma,
-    used, thickness, spread, reduced,
-):  # fmt: skip
+def _joint_band(amplitude, inverse, grid, mean, order, offset, sigma, pixels):  # type: ignore[no-untyped-def]
     """Pixels of some rows; those that left out a wavelength in the first fit stay as they are."""
+    tables, silicon_start, silicon_step, start, step, _ = grid
+    thickness, spread, reduced, used = pixels
     bands = amplitude.shape[0]
     rows, columns = thickness.shape
     padded = tables.shape[2]

@@ -7,12 +7,12 @@ distribution that is free on a grid: Laird 1978, J. Am. Stat. Assoc. 73, 805).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...array_types import BoolArray, FloatArray
+from ...array_types import BoolArray, Float32Array, FloatArray
 from ...compiled import kernel
 from .newton import score
 
@@ -27,8 +27,7 @@ _WEIGHTS = np.geomspace(0.5, 512.0, 11).astype(np.float32)
 """Cells around one that all cells together may count for."""
 
 
-@dataclass(frozen=True, eq=False)
-class Leanings:
+class Leanings(NamedTuple):
     """What the pixels of each cell show about the surface."""
 
     # number, score, information, squares: pixels; sums of their scores and of their information on the surface, and
@@ -40,10 +39,7 @@ class Leanings:
 
 
 def local_variance(
-    seen: Leanings,
-    surface_variance: FloatArray,
-    widths: tuple[float, float],
-    independence: float = 1.0,
+    seen: Leanings, surface_variance: FloatArray, widths: tuple[float, float], independence: float = 1.0
 ) -> FloatArray:
     """Expected square of the distance of the pixels of each cell from their surface, beyond all noise.
 
@@ -96,9 +92,7 @@ def responsibility(likely: NDArray[np.floating], share: NDArray[np.floating]) ->
     return np.asarray(mixed / mixed.sum(axis=1, keepdims=True))
 
 
-def _with_neighbours(
-    likely: NDArray[np.float32], share: NDArray[np.float32], known: BoolArray
-) -> NDArray[np.float32]:
+def _with_neighbours(likely: Float32Array, share: Float32Array, known: BoolArray) -> Float32Array:
     """What is expected of each ``known`` cell before it is asked: ``share``, and what those around it show."""
     place = np.full(np.add(known.shape, 2 * _REACH), len(likely))
     place[_REACH:-_REACH, _REACH:-_REACH][known] = np.arange(len(likely))
@@ -108,7 +102,7 @@ def _with_neighbours(
     ]
     count = (np.stack(neighbours, axis=1) < len(likely)).sum(axis=1, keepdims=True, dtype=np.float32)
     shown = np.zeros((len(likely) + 1, share.size), np.float32)
-    expected: NDArray[np.float32] = np.broadcast_to(share, likely.shape)
+    expected: Float32Array = np.broadcast_to(share, likely.shape)
     for _ in range(_ROUNDS_AROUND):
         shown[:-1] = responsibility(likely, expected)
         beside, best = np.zeros_like(likely), -np.inf
@@ -123,12 +117,8 @@ def _with_neighbours(
 
 
 def _likelihood(
-    seen: Leanings,
-    surface_variance: FloatArray,
-    together: FloatArray,
-    alone: FloatArray,
-    independence: float,
-) -> NDArray[np.float32]:
+    seen: Leanings, surface_variance: FloatArray, together: FloatArray, alone: FloatArray, independence: float
+) -> Float32Array:
     """Likelihood of each pair of squared widths in each cell that has pixels, relative to the largest."""
     known = seen.number > 0
     n, total, information, squares, surface = (
@@ -145,10 +135,9 @@ def _likelihood(
 
 
 @kernel(relaxed=True)
-def lean_strip(  # type: ignore[no-untyped-def]
-    amplitude, weight, table, start, step, holds, terms, cell_of, away_y, away_x, begin, number, total, known, squares
-):  # fmt: skip
+def lean_strip(amplitude, weight, grid, holds, terms, cell_of, away_y, away_x, begin, sums):  # type: ignore[no-untyped-def]
     """One row of cells: the surface at each pixel [µm], and the sums of `Leanings`."""
+    (table, start, step), (number, total, known, squares) = grid, sums
     bands, top = amplitude.shape[0], table.shape[0] - 1.0
     value, inverse = np.zeros((1, table.shape[1]), np.float32), np.zeros((1, table.shape[1]), np.float32)
     for r in range(begin.shape[0]):

@@ -9,14 +9,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...array_types import BoolArray, FloatArray
+from ...array_types import BoolArray, Float32Array, FloatArray
 from .cells import Cells
 from .learning import moves_of
 from .learning_cells import LearningCells
 from .local_surface import shares_of_middle
 from .nuisances import NuisanceFit, Nuisances, patterns_of_cells
 from .pixels import CellSurface
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _MOST_PLACES = 32  # Places along a side of the sensor at which the surface is asked
 _AT_ONCE = 256
@@ -26,15 +26,15 @@ def learned_sigma(
     cells: Cells,
     surface: CellSurface,
     leaning: BoolArray,
-    base: FringeTemplates,
+    base: FlatTemplates,
     free: Nuisances,
     fit: NuisanceFit,
     order_um: float,
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Standard uncertainty of the thickness of every pixel from all that was learned but the scale [µm].
 
-    ``leaning``: pixels that have the surface of the cells as their prior, bool, ``(ny, nx)``; ``order_um``:
-    thickness of one fringe order [µm]. Returns float32, ``(ny, nx)``.
+    ``leaning``: pixels that have the surface of the cells as their prior, bool, ``(ny, nx)``. Returns float32,
+    ``(ny, nx)``.
     """
     if fit.covariance.size == 0 or not surface.known.any():
         return np.zeros(leaning.shape, np.float32)
@@ -66,7 +66,7 @@ def _variances(
     surface: CellSurface,
     y: NDArray[np.intp],
     x: NDArray[np.intp],
-    base: FringeTemplates,
+    base: FlatTemplates,
     free: Nuisances,
     fit: NuisanceFit,
     order_um: float,

@@ -20,7 +20,7 @@ from .evidence import refine_row
 from .learning_cells import LearningCells
 from .misfit import Misfit, shared_variances
 from .nuisances import OVERTONES, NuisanceFit, Nuisances, light_widths
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 from .wavelengths import CommonError, common_error, shift_precision
 
 _ROUNDS = 8
@@ -37,7 +37,7 @@ _FREE = 1e-4  # Precision of what has no prior
 
 def learn(
     cells: LearningCells,
-    base: FringeTemplates,
+    base: FlatTemplates,
     free: Nuisances,
     start: NuisanceFit,
     rounds: int = _ROUNDS,
@@ -78,12 +78,12 @@ class _Problem:
     """Cells, model and prior of one sensor."""
 
     cells: LearningCells
-    base: FringeTemplates
+    base: FlatTemplates
     free: Nuisances
     overtones: FloatArray | None
 
     @classmethod
-    def of(cls, cells: LearningCells, base: FringeTemplates, free: Nuisances) -> _Problem:
+    def of(cls, cells: LearningCells, base: FlatTemplates, free: Nuisances) -> _Problem:
         """Only the part of the templates that the cells need."""
         margin = _TEMPLATE_MARGIN_UM + 0.01 * float(cells.thickness_um.max())
         part, rows = base.part(
@@ -105,7 +105,7 @@ class _Problem:
             + (self.free.wavelength_accuracy_nm > 0.0)
         )
 
-    def templates(self, fit: NuisanceFit) -> FringeTemplates:
+    def templates(self, fit: NuisanceFit) -> FlatTemplates:
         """The model with what was learned."""
         return self.base.as_found(
             fit.contrast, fit.shift_nm, fit.fading, fit.overtones, fit.middle_um, self.overtones
@@ -121,15 +121,15 @@ class _Problem:
         """Refined thickness, model amplitude, its slope, and what is left of the cells."""
         wavelengths = self.base.n_wavelengths
         fitted = replace(self.templates(fit), mean_response=fit.mean_response)
-        table = fitted.table()
+        grid = fitted.grid()
         value = self.cells.value.copy()
         if fit.coefficients.size:
             light = np.exp(self.cells.pattern @ fit.coefficients.T)
             value[:, :wavelengths] = (1.0 + value[:, :wavelengths]) / light - 1.0
         found = np.full_like(thickness, np.nan)
-        refine_row(value, self.cells.weight, table, fitted.start_um, fitted.step_um, thickness, found)
+        refine_row(value, self.cells.weight, *grid, thickness, found)
         found = np.where(np.isfinite(found), found, thickness)
-        model, slope = _curve(fitted, table, found)
+        model, slope = _curve(fitted, grid.table, found)
         return found, model, slope, value[:, :wavelengths] - model
 
     def step(
@@ -352,7 +352,7 @@ class _Problem:
 
 
 def moves_of(
-    cells: LearningCells, base: FringeTemplates, free: Nuisances, fit: NuisanceFit
+    cells: LearningCells, base: FlatTemplates, free: Nuisances, fit: NuisanceFit
 ) -> tuple[FloatArray, FloatArray]:
     """What a change of all that was learned does to the thickness of each cell.
 
@@ -365,7 +365,7 @@ def moves_of(
 
 
 def _curve(
-    fitted: FringeTemplates, table: NDArray[np.float32], thickness_um: NDArray[np.float32]
+    fitted: FlatTemplates, table: NDArray[np.float32], thickness_um: NDArray[np.float32]
 ) -> tuple[FloatArray, FloatArray]:
     """Amplitudes of templates, whose table it is, and their slopes [1/µm], shape ``(n, n_wavelengths)``."""
     place = np.clip((thickness_um.astype(float) - fitted.start_um) / fitted.step_um, 2.0, len(table) - 4.0)

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.special import gammaincinv
 
-from ...array_types import BoolArray, FloatArray
+from ...array_types import BoolArray, Float32Array, FloatArray
 from ...compiled import kernel
 from .cells import Cells
 from .leaning import most_likely_shares, responsibility
 from .newton import score
 from .pixels import LONE_CELL_PENALTY, SAME_SURFACE, CellSurface
 from .posterior import REACH
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _SIDE = np.arange(-2, 3)  # Cells about one that show its surface
 _FAR = 2  # Cells that are so many away have others between them and the one in the middle
@@ -47,26 +47,21 @@ class LocalSurface:
     """Surface about each cell."""
 
     # of 1, y, x, y², xy, x², with y and x in pixels from the centre of the cell [µm], float32, ``(ncy, ncx, 6)``
-    terms: NDArray[np.float32]
+    terms: Float32Array
     # standard uncertainty of the first [µm]: the noise of the cells, and what they leave over beyond that of most;
     # infinite where nobody asked, float32, ``(ncy, ncx)``
-    sigma_um: NDArray[np.float32]
+    sigma_um: Float32Array
     # whether the cell and its eight neighbours lie on their surfaces, and more cells show it than it has terms,
     # bool, ``(ncy, ncx)``
     holds: BoolArray
 
 
 def local_surface(
-    surface: CellSurface,
-    cells: Cells,
-    templates: FringeTemplates,
-    asked: BoolArray,
-    order_um: float,
+    surface: CellSurface, cells: Cells, templates: FlatTemplates, asked: BoolArray, order_um: float
 ) -> LocalSurface:
     """The most likely surfaces about the cells that are asked.
 
-    ``asked``: cells whose surface is wanted, bool, ``(ncy, ncx)``; ``order_um``: thickness of one fringe order
-    [µm].
+    ``asked``: cells whose surface is wanted, bool, ``(ncy, ncx)``.
     """
     terms, sigma = np.zeros((*asked.shape, 6), np.float32), np.full(asked.shape, np.inf, np.float32)
     found = LocalSurface(terms, sigma, np.zeros(asked.shape, bool))
@@ -152,11 +147,7 @@ def _allow_for_misfit(found: LocalSurface, asked: BoolArray, misfit: FloatArray)
 
 
 def shares_of_middle(
-    surface: CellSurface,
-    precision: FloatArray,
-    y: NDArray[np.intp],
-    x: NDArray[np.intp],
-    order_um: float,
+    surface: CellSurface, precision: FloatArray, y: NDArray[np.intp], x: NDArray[np.intp], order_um: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
     """Rows and columns of the cells about some, and the share of each in the surface of the one in the middle."""
     b, a, known, design, _ = _window(surface, precision, y, x)

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import BoolArray, Float32Array, FloatArray
 from .cells import Cells
 from .evidence import IMPOSSIBLE, OrderEvidence, order_evidence, refine_cells
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,17 +23,17 @@ class LoneSurfaces:
     """Order of the lone surfaces."""
 
     # thickness of all cells; only those of lone surfaces may have changed, float32, ``(ncy, ncx)``
-    thickness_um: NDArray[np.float32]
+    thickness_um: Float32Array
     surface: NDArray[np.intp]  # numbers of the lone surfaces, ``(n,)``
-    slip: NDArray[np.float64]  # probability that their order is wrong, ``(n,)``
+    slip: FloatArray  # probability that their order is wrong, ``(n,)``
 
 
 def settle_lone_surfaces(
     cells: Cells,
-    templates: FringeTemplates,
-    thickness_um: NDArray[np.float32],
+    templates: FlatTemplates,
+    thickness_um: Float32Array,
     segment: NDArray[np.int32],
-    independence: NDArray[np.float64],
+    independence: FloatArray,
     order_um: float,
     *,
     range_um: tuple[float, float],
@@ -43,11 +44,9 @@ def settle_lone_surfaces(
     """Give every lone surface the order that all its cells together prefer.
 
     ``thickness_um``: thickness so far [µm]; NaN where a cell has no data, float32, ``(ncy, ncx)``; ``segment``:
-    number of the surface each cell lies on; -1 where a cell has no data, int32, ``(ncy, ncx)``; ``independence``:
-    how much more independent the cells of each surface are than ``temper`` says, ``(n_segments,)``; ``order_um``:
-    thickness of one fringe order [µm]; ``range_um``: thicknesses that are possible [µm]; ``temper``: independent
-    cells per cell, as for `order_evidence`; ``most_cells``: largest surface that is looked at; larger ones have
-    cells enough.
+    number of the surface each cell lies on; -1 where a cell has no data, int32, ``(ncy, ncx)``; ``independence``: how
+    much more independent the cells of each surface are than ``temper`` says, ``(n_segments,)``; ``most_cells``:
+    largest surface that is looked at; larger ones have cells enough.
     """
     surface = np.flatnonzero(_are_lone(segment) & (np.bincount(segment[segment >= 0]) <= most_cells))
     member = np.flatnonzero(np.isin(segment, surface))
@@ -66,7 +65,7 @@ def settle_lone_surfaces(
     return LoneSurfaces(out, surface, slip)
 
 
-def _are_lone(segment: NDArray[np.int32]) -> NDArray[np.bool_]:
+def _are_lone(segment: NDArray[np.int32]) -> BoolArray:
     """Which surfaces touch no other."""
     lone = np.ones(int(segment.max(initial=-1)) + 1, bool)
     for near, far in ((segment[1:], segment[:-1]), (segment[:, 1:], segment[:, :-1])):
@@ -79,7 +78,7 @@ def _are_lone(segment: NDArray[np.int32]) -> NDArray[np.bool_]:
 def _pick(cells: Cells, member: NDArray[np.intp]) -> Cells:
     """Some cells, in one row."""
 
-    def row(part: NDArray[np.float32]) -> NDArray[np.float32]:
+    def row(part: Float32Array) -> Float32Array:
         return np.ascontiguousarray(part.reshape(-1, part.shape[-1])[member][None])
 
     return Cells(
@@ -93,8 +92,8 @@ def _pick(cells: Cells, member: NDArray[np.intp]) -> Cells:
 
 
 def _totals(
-    found: OrderEvidence, thickness_um: NDArray[np.float32], place: NDArray[np.intp], surfaces: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    found: OrderEvidence, thickness_um: Float32Array, place: NDArray[np.intp], surfaces: int
+) -> tuple[FloatArray, NDArray[np.int64]]:
     """Summed evidence of each surface at shifts of ``-(n-1) ... n-1`` orders, and the order of each cell now."""
     evidence = found.evidence[0]
     orders = evidence.shape[1]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import Float32Array
 from .amplitudes import Amplitudes
 from .cells import Cells, sample_pixels
 from .evidence import refine_cells
 from .pixels import CellSurface
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _MEAN_TOLERANCE = 2e-6
 """Relative change of the mean response that is left alone: far below the noise of a smoothed flat."""
@@ -18,15 +18,15 @@ SENSOR_ORDERS = 3.0
 """Orders of thickness that a sensor must span before its mean is near that of the range, whatever its order."""
 
 
-def spans_orders(thickness_um: NDArray[np.float32], order_um: float, orders: float = SENSOR_ORDERS) -> bool:
+def spans_orders(thickness_um: Float32Array, order_um: float, orders: float = SENSOR_ORDERS) -> bool:
     """Whether a sensor holds enough orders for the mean response over it to be known from its map."""
     values = thickness_um[np.isfinite(thickness_um)]
     return values.size > 0 and float(np.ptp(np.percentile(values, (2.0, 98.0)))) > orders * order_um
 
 
 def normalise_to_cells(
-    cells: Cells, templates: FringeTemplates, thickness_um: NDArray[np.float32], threads: int = 2
-) -> tuple[NDArray[np.float32], FringeTemplates]:
+    cells: Cells, templates: FlatTemplates, thickness_um: Float32Array, threads: int = 2
+) -> tuple[Float32Array, FlatTemplates]:
     """Refit the cells and renormalise the templates in turn until neither changes.
 
     A wrong mean response shifts each thickness by a little that depends on its phase, and so bends the very
@@ -45,15 +45,15 @@ def normalise_to_cells(
 
 
 def normalise_to_pixels(
-    data: Amplitudes, templates: FringeTemplates, surface: CellSurface, threads: int
-) -> FringeTemplates:
+    data: Amplitudes, templates: FlatTemplates, surface: CellSurface, threads: int
+) -> FlatTemplates:
     """Renormalise to single pixels: a steep cell spreads over a part of a fringe that its mean does not show."""
     return normalise_to_cells(*_sample_on(data, surface, templates, threads))[1]
 
 
 def _sample_on(
-    data: Amplitudes, surface: CellSurface, templates: FringeTemplates, threads: int
-) -> tuple[Cells, FringeTemplates, NDArray[np.float32], int]:
+    data: Amplitudes, surface: CellSurface, templates: FlatTemplates, threads: int
+) -> tuple[Cells, FlatTemplates, Float32Array, int]:
     """Some single pixels, and where they begin, as `normalise_to_cells` takes them."""
     sample = sample_pixels(data)
     start = surface.at(sample.y_edges[:-1], sample.x_edges[:-1])

@@ -17,7 +17,7 @@ from scipy.special import gammaln
 
 from ...array_types import FloatArray
 from ...compiled import subkernel
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _TAILS = np.geomspace(2.0, 1024.0, 10)
 """Degrees of freedom that are tried; the likelihood changes little from one to the next."""
@@ -66,7 +66,7 @@ def improbability(chi2, freedom, scale, tail):  # type: ignore[no-untyped-def]
 def judge_cells(
     value: NDArray[np.float32],
     weight: NDArray[np.float32],
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     thickness_um: NDArray[np.floating],
     order_um: float,
 ) -> tuple[Misfit, FloatArray]:

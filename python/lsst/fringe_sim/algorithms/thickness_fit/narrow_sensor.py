@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...array_types import FloatArray
+from ...array_types import Float32Array, FloatArray
 from ...compiled import kernel, run_threaded, subkernel
 from .cells import Cells
 from .evidence import refine_row
-from .templates import FringeTemplates, pad_wavelengths
+from .templates import FlatTemplates, pad_wavelengths
 
 _MOST_CELLS = 600  # Cells that are asked; more would only add certainty
 _FEW_CELLS = 120  # Cells with which all starts are compared; only the best of these go on with more
@@ -52,7 +52,7 @@ _OWN_MEAN = 0.1
 class NarrowSensor:
     """What a sensor of few orders says about its common thickness."""
 
-    templates: FringeTemplates  # the model with the mean response of the best solution
+    templates: FlatTemplates  # the model with the mean response of the best solution
     range_um: tuple[float, float]  # least and largest thickness of the solution [µm]
     slip: float  # probability that another solution is true
     sigma_um: float  # uncertainty of the mean thickness of the sensor [µm]
@@ -60,13 +60,13 @@ class NarrowSensor:
     cell: NDArray[np.intp]  # which cells were asked, counted row by row, ``(n,)``
     cell_um: FloatArray  # their thickness [µm], ``(n,)``
 
-    def agrees_with(self, thickness_um: NDArray[np.float32], order_um: float) -> bool:
+    def agrees_with(self, thickness_um: Float32Array, order_um: float) -> bool:
         """Whether a map has the same orders where cells were asked, but for a few of them."""
         miss = np.abs(thickness_um.ravel()[self.cell] - self.cell_um)
         return bool(np.mean(miss < _SAME_SOLUTION * order_um) > 1.0 - _FEW_ASTRAY)
 
 
-def is_own_mean(cells: Cells, templates: FringeTemplates) -> bool:
+def is_own_mean(cells: Cells, templates: FlatTemplates) -> bool:
     """Whether the flats are over their mean over these very cells, not over a larger sensor they were cut from."""
     wavelengths = templates.n_wavelengths
     weight = cells.weight[..., :wavelengths] > 0.0
@@ -78,8 +78,8 @@ def is_own_mean(cells: Cells, templates: FringeTemplates) -> bool:
 
 def settle_narrow_sensor(
     cells: Cells,
-    templates: FringeTemplates,
-    ideas_um: Sequence[NDArray[np.float32]],
+    templates: FlatTemplates,
+    ideas_um: Sequence[Float32Array],
     order_um: float,
     *,
     range_um: tuple[float, float],
@@ -91,9 +91,7 @@ def settle_narrow_sensor(
 
     ``ideas_um``: ideas of the thickness [µm], of which the shape is used; NaN where a cell has no data. The shape
     that is true within half an order everywhere must be among them, or the result may be wrong, float32,
-    ``(ncy, ncx)``; ``order_um``: thickness of one fringe order [µm]; ``range_um``: possible thicknesses [µm];
-    ``temper``: independent cells per cell, as for `order_evidence`; ``earlier``: solutions from other ideas, which
-    compete with the new ones.
+    ``(ncy, ncx)``; ``earlier``: solutions from other ideas, which compete with the new ones.
     """
     sample, shapes_um, middles_um = _Sample.of(cells, ideas_um, templates.n_wavelengths, _MOST_CELLS)
     stride = max(shapes_um.shape[1] // _FEW_CELLS, 1)
@@ -161,14 +159,14 @@ class _Sample:
     the model are divided by may be compared.
     """
 
-    level: NDArray[np.float32]
-    weight: NDArray[np.float32]
+    level: Float32Array
+    weight: Float32Array
     share: FloatArray
     cell: NDArray[np.intp]
 
     @classmethod
     def of(
-        cls, cells: Cells, ideas_um: Sequence[NDArray[np.float32]], wavelengths: int, most: int
+        cls, cells: Cells, ideas_um: Sequence[Float32Array], wavelengths: int, most: int
     ) -> tuple[_Sample, FloatArray, FloatArray]:
         """Cells at equal distances that have most wavelengths, their thickness about its middle, and that middle.
 
@@ -199,7 +197,7 @@ class _Sample:
         )
 
     def follow(
-        self, templates: FringeTemplates, starts_um: FloatArray, rounds: int, threads: int
+        self, templates: FlatTemplates, starts_um: FloatArray, rounds: int, threads: int
     ) -> list[_Solution]:
         """Refit and renormalise in turn, from each of some starts of shape ``(starts, n)``.
 
@@ -221,7 +219,7 @@ class _Sample:
         wavelengths = templates.n_wavelengths
         return [_Solution(t, m[:wavelengths], float(c)) for t, m, c in zip(out, mean, chi2, strict=True)]
 
-    def better_sides(self, solution: _Solution, templates: FringeTemplates, order_um: float) -> FloatArray:
+    def better_sides(self, solution: _Solution, templates: FlatTemplates, order_um: float) -> FloatArray:
         """Thickness of every cell at the least chi-square within half an order, the mean response being as it is."""
         table = pad_wavelengths(templates.response)
         origin, step = templates.start_um, templates.step_um
@@ -335,7 +333,7 @@ class _Together:
     chi2: float
 
     @classmethod
-    def of(cls, sample: _Sample, thickness_um: FloatArray, templates: FringeTemplates) -> _Together:
+    def of(cls, sample: _Sample, thickness_um: FloatArray, templates: FlatTemplates) -> _Together:
         """At a thickness of every cell; the mean is that of these thicknesses."""
         wavelengths, count, step = templates.n_wavelengths, len(sample.weight), templates.step_um
         place = (thickness_um - templates.start_um) / step
@@ -369,7 +367,7 @@ class _Together:
         return np.asarray(inverse * right - scaled @ answer)
 
 
-def _settle_together(sample: _Sample, solution: _Solution, templates: FringeTemplates) -> _Solution:
+def _settle_together(sample: _Sample, solution: _Solution, templates: FlatTemplates) -> _Solution:
     """Levenberg-Marquardt steps of all cells at once: refitting and renormalising in turn crawls."""
     thickness, damping = solution.thickness_um.astype(float), 1e-6
     state = _Together.of(sample, thickness, templates)
@@ -389,7 +387,7 @@ def _settle_together(sample: _Sample, solution: _Solution, templates: FringeTemp
 
 
 def _settle_sides(
-    sample: _Sample, solution: _Solution, templates: FringeTemplates, order_um: float
+    sample: _Sample, solution: _Solution, templates: FlatTemplates, order_um: float
 ) -> _Solution:
     """Settle a solution again with the cells that had taken the wrong side of a crest on the other one.
 
@@ -407,7 +405,7 @@ def _settle_sides(
     return settled
 
 
-def _common_sigma(sample: _Sample, solution: _Solution, templates: FringeTemplates) -> float:
+def _common_sigma(sample: _Sample, solution: _Solution, templates: FlatTemplates) -> float:
     """Standard uncertainty of the mean thickness of the sampled cells, as if they were the whole sensor [µm]."""
     together = _Together.of(sample, solution.thickness_um, templates)
     everywhere = np.ones(len(solution.thickness_um))

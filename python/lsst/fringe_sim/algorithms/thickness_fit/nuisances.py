@@ -18,7 +18,7 @@ from ...array_types import FloatArray
 from ...errors import InputError, OutOfRangeError, UnknownNameError
 from ..thickness_fit_options import CONTRASTS, ZONES
 from .cells import Cells
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _ROWS = 16  # Rows of cells whose light is made at a time
 OVERTONES = 4  # Numbers that describe the overtones at one wavelength
@@ -142,7 +142,7 @@ class NuisanceFit:
     shift_nm: FloatArray
     shift_sigma_nm: FloatArray
     fading: float = 0.0  # logarithmic loss of contrast per thickness [1/µm]
-    # what is added of the overtones of the model, as factors on `FringeTemplates.overtones`, ``(n_wavelengths, 4)``
+    # what is added of the overtones of the model, as factors on `FlatTemplates.overtones`, ``(n_wavelengths, 4)``
     overtones: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
     middle_um: float = 0.0  # thickness at which ``contrast`` holds [µm]
     scale_sigma: float = 0.0  # standard uncertainty of the scale of the thickness, which all pixels share
@@ -187,7 +187,7 @@ class NuisanceFit:
             )
         return out
 
-    def applied_to(self, base: FringeTemplates) -> FringeTemplates:
+    def applied_to(self, base: FlatTemplates) -> FlatTemplates:
         """Templates of a sensor with this contrast and these wavelengths."""
         found = base.as_found(self.contrast, self.shift_nm, self.fading, self.overtones, self.middle_um)
         return replace(found, mean_response=self.mean_response) if self.mean_response.size else found

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import Float32Array, FloatArray
 from ...compiled import kernel, subkernel
 from .cells import Cells
 from .evidence import IMPOSSIBLE, OrderEvidence
@@ -35,7 +36,7 @@ SURE = 60.0
 """Chi-square difference between the best and the next order at which a region is sure of its order."""
 
 
-def solve_orders(cells: Cells, found: OrderEvidence, sure: float = SURE) -> NDArray[np.float32]:
+def solve_orders(cells: Cells, found: OrderEvidence, sure: float = SURE) -> Float32Array:
     """Join cells into regions and give each region its absolute order.
 
     ``sure``: regions that are surer of their order than this chi-square difference stay apart where they disagree.
@@ -58,7 +59,7 @@ def solve_orders(cells: Cells, found: OrderEvidence, sure: float = SURE) -> NDAr
 
 
 def _links(
-    phase_um: NDArray[np.float32], rise_y: NDArray[np.float32], rise_x: NDArray[np.float32], order_um: float
+    phase_um: Float32Array, rise_y: Float32Array, rise_x: Float32Array, order_um: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.uint16]]:
     """Pairs of neighbouring cells, the orders between their phases, and how unreliable each pair is.
 
@@ -82,7 +83,7 @@ def _links(
     return y * nx + x, y_next * nx + x_next, turn, key
 
 
-def _sums_at_cells(links: NDArray[Any]) -> NDArray[np.float64]:
+def _sums_at_cells(links: NDArray[Any]) -> FloatArray:
     """Sum over the links that end at each cell, whose last axis is for those to the right and below."""
     total = np.zeros(links.shape[:2])
     total[1:] += links[:-1, :, 1]

@@ -7,18 +7,19 @@ its own amplitudes prefer.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, uniform_filter
 
+from ...array_types import BoolArray, Float32Array, FloatArray
 from ...compiled import kernel, run_threaded, subkernel
 from .amplitudes import Amplitudes
 from .bands import BAND_ROWS, load_band
 from .medians import middle_of
 from .newton import gauss_newton, newton_block
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _STEPS = 5  # Most Gauss-Newton steps; two are usual
 _LONGEST_STEP = 0.1  # Longest Gauss-Newton step, in fringe orders
@@ -29,51 +30,51 @@ LONE_CELL_PENALTY = 12.0
 _BLOCK = 32
 
 
-@dataclass(frozen=True, eq=False)
-class PixelFit:
+class PixelFit(NamedTuple):
     """Result for every pixel; NaN (and 0 wavelengths) where there was nothing to fit."""
 
     # value, sigma: thickness and its standard uncertainty [µm], float32, ``(ny, nx)``
-    value: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-    chi2: NDArray[np.float32]  # reduced chi-square, float32, ``(ny, nx)``
+    value: Float32Array
+    sigma: Float32Array
+    chi2: Float32Array  # reduced chi-square, float32, ``(ny, nx)``
     n_wavelengths: NDArray[np.int32]  # number of wavelengths used, int32, ``(ny, nx)``
 
+    def rows(self, part: slice) -> PixelFit:
+        """Views of some rows."""
+        return PixelFit(self.value[part], self.sigma[part], self.chi2[part], self.n_wavelengths[part])
 
-@dataclass(frozen=True, eq=False)
-class CellSurface:
+
+class CellSurface(NamedTuple):
     """Thickness and slope of every cell, and where cells lie on one surface."""
 
     # thickness_um, slope_y, slope_x: thickness at the centre [µm] and its slopes [µm/px]; finite everywhere,
     # float32, ``(ncy, ncx)``
-    thickness_um: NDArray[np.float32]
-    slope_y: NDArray[np.float32]
-    slope_x: NDArray[np.float32]
+    thickness_um: Float32Array
+    slope_y: Float32Array
+    slope_x: Float32Array
     # y_centre, x_centre: centres of the cells [px]
-    y_centre: NDArray[np.float64]
-    x_centre: NDArray[np.float64]
-    smooth: NDArray[
-        np.bool_
-    ]  # whether a cell and its eight neighbours lie on one surface, bool, ``(ncy, ncx)``
+    y_centre: FloatArray
+    x_centre: FloatArray
+    smooth: BoolArray  # whether a cell and its eight neighbours lie on one surface, bool, ``(ncy, ncx)``
     # whether a cell has data; the thickness of the others is borrowed, and no evidence for a surface, bool,
     # ``(ncy, ncx)``
-    known: NDArray[np.bool_]
+    known: BoolArray
     # standard uncertainty of the thickness from the noise of the flats [µm]; infinite where it is not known,
     # float32, ``(ncy, ncx)``
-    sigma_um: NDArray[np.float32]
+    sigma_um: Float32Array
 
     @classmethod
     def from_cells(
         cls,
-        thickness_um: NDArray[np.float32],
+        thickness_um: Float32Array,
         slope_y: NDArray[np.floating],
         slope_x: NDArray[np.floating],
-        y_centre: NDArray[np.float64],
-        x_centre: NDArray[np.float64],
+        y_centre: FloatArray,
+        x_centre: FloatArray,
         order_um: float,
-        known: NDArray[np.bool_],
-        sigma_um: NDArray[np.float32],
-    ) -> CellSurface:
+        known: BoolArray,
+        sigma_um: Float32Array,
+    ) -> Self:
         """Find out which cells lie on one surface."""
         rise = np.diff(y_centre)[:, None] * 0.5 * (slope_y[1:] + slope_y[:-1])
         run = np.diff(x_centre)[None, :] * 0.5 * (slope_x[:, 1:] + slope_x[:, :-1])
@@ -96,7 +97,7 @@ class CellSurface:
             sigma_um,
         )
 
-    def at(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
+    def at(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Float32Array:
         """Bilinear surface at some rows and columns of pixels, shape ``(len(rows), len(columns))`` [µm]."""
         below_y, share_y = (part[rows] for part in bracket(self.y_centre, int(rows.max()) + 1))
         below_x, share_x = (part[columns] for part in bracket(self.x_centre, int(columns.max()) + 1))
@@ -116,10 +117,7 @@ def calm_surface(surface: CellSurface, threads: int = 2) -> CellSurface:
     out = surface.thickness_um.copy()
 
     def work(row: int) -> None:
-        _calm_row(
-            surface.thickness_um, surface.slope_y, surface.slope_x, surface.y_centre, surface.x_centre,
-            surface.smooth, row, out[row],
-        )  # fmt: skip
+        _calm_row(surface, row, out[row])
 
     run_threaded(work, len(out), threads)
     calm = surface.smooth & (surface.sigma_um > 0.0)
@@ -129,15 +127,14 @@ def calm_surface(surface: CellSurface, threads: int = 2) -> CellSurface:
     )
     # The median of independent normal numbers about one value, each of an uncertainty of its own.
     sigma = np.sqrt(0.5 * np.pi * np.maximum(number, 0.0)) / np.maximum(total, 1e-30)
-    return replace(
-        surface,
-        thickness_um=out,
-        sigma_um=np.where(surface.smooth, sigma, surface.sigma_um).astype(np.float32),
+    return surface._replace(
+        thickness_um=out, sigma_um=np.where(surface.smooth, sigma, surface.sigma_um).astype(np.float32)
     )
 
 
 @kernel
-def _calm_row(thickness, slope_y, slope_x, y_centre, x_centre, smooth, row, out):  # type: ignore[no-untyped-def]
+def _calm_row(surface, row, out):  # type: ignore[no-untyped-def]
+    thickness, slope_y, slope_x, y_centre, x_centre, smooth, _, _ = surface
     ny, nx = thickness.shape
     guess = np.empty(25, np.float64)
     for x in range(nx):
@@ -154,40 +151,26 @@ def _calm_row(thickness, slope_y, slope_x, y_centre, x_centre, smooth, row, out)
 
 
 def fit_pixels(
-    data: Amplitudes,
-    templates: FringeTemplates,
-    surface: CellSurface,
-    order_um: float,
-    *,
-    threads: int = 2,
+    data: Amplitudes, templates: FlatTemplates, surface: CellSurface, order_um: float, *, threads: int = 2
 ) -> PixelFit:
-    """Refine every pixel.
-
-    ``order_um``: thickness of one fringe order [µm].
-    """
+    """Refine every pixel."""
     _, ny, nx = data.shape
     value, sigma, chi2 = (np.empty((ny, nx), np.float32) for _ in range(3))
-    used = np.zeros((ny, nx), np.int32)
-    table = templates.table()
-    below_x, share_x = bracket(surface.x_centre, nx)
-    below_y, share_y = bracket(surface.y_centre, ny)
+    found = PixelFit(value, sigma, chi2, np.zeros((ny, nx), np.int32))
+    grid = templates.grid()
+    along_y, along_x = bracket(surface.y_centre, ny), bracket(surface.x_centre, nx)
 
     def work(band: int) -> None:
         low, high = band * BAND_ROWS, min((band + 1) * BAND_ROWS, ny)
         amplitude, weight = load_band(data, low, high)
-        grid = (table, templates.start_um, templates.step_um, order_um)
-        _fit_band(
-            amplitude, weight, *grid,
-            surface.thickness_um, surface.slope_y, surface.slope_x, surface.y_centre, surface.x_centre,
-            surface.smooth, surface.known, low, below_y, share_y, below_x, share_x,
-            value[low:high], sigma[low:high], chi2[low:high], used[low:high],
-        )  # fmt: skip
+        part = found.rows(slice(low, high))
+        _fit_band(amplitude, weight, grid, order_um, surface, low, along_y, along_x, part)
 
     run_threaded(work, -(-ny // BAND_ROWS), threads)
-    return PixelFit(value, sigma, chi2, used)
+    return found
 
 
-def bracket(centre: NDArray[np.float64], length: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def bracket(centre: FloatArray, length: int) -> tuple[NDArray[np.int64], Float32Array]:
     """For each pixel the cell centre below it, and how far it is to the next (outside 0..1: beyond the ends)."""
     if len(centre) == 1:
         return np.zeros(length, np.int64), np.zeros(length, np.float32)
@@ -198,11 +181,11 @@ def bracket(centre: NDArray[np.float64], length: int) -> tuple[NDArray[np.int64]
 
 
 @kernel(relaxed=True)
-def _fit_band(  # type: ignore[no-untyped-def]
-    amplitude, weight, table, start, step, order,
-    thickness, slope_y, slope_x, y_centre, x_centre, smooth, known, first_row, below_y, share_y, below_x, share_x,
-    value, sigma, chi2_out, used_out,
-):  # fmt: skip
+def _fit_band(amplitude, weight, grid, order, surface, first_row, along_y, along_x, found):  # type: ignore[no-untyped-def]
+    table, start, step = grid
+    value, sigma, chi2_out, used_out = found
+    (below_y, share_y), (below_x, share_x) = along_y, along_x
+    thickness, smooth = surface.thickness_um, surface.smooth
     bands = amplitude.shape[0]
     rows, columns = value.shape
     padded = table.shape[1]
@@ -218,17 +201,8 @@ def _fit_band(  # type: ignore[no-untyped-def]
         for band in range(bands):
             for x in range(columns):
                 used_out[r, x] += np.int32(weight[band, r, x] > np.float32(0.0))
-        own_y = _start_row(
-            thickness,
-            smooth,
-            below_y[first_row + r],
-            share_y[first_row + r],
-            below_x,
-            share_x,
-            upright,
-            begin,
-            flat,
-        )
+        below, share = below_y[first_row + r], share_y[first_row + r]
+        own_y = _start_row(thickness, smooth, below, share, below_x, share_x, upright, begin, flat)
         for first in range(0, columns, _BLOCK):
             size = min(_BLOCK, columns - first)
             for band in range(bands):
@@ -243,9 +217,8 @@ def _fit_band(  # type: ignore[no-untyped-def]
                 if not flat[x] and used_out[r, x] > 0:
                     own_x = below_x[x] if share_x[x] < 0.5 else min(below_x[x] + 1, thickness.shape[1] - 1)
                     place[b], information[b], misfit[b] = _try_surfaces(
-                        table, start, step, order, y, w, b, thickness, slope_y, slope_x, known,
-                        y_centre, x_centre, first_row + r, x, own_y, own_x, longest,
-                    )  # fmt: skip
+                        grid, order, y, w, b, surface, first_row + r, x, own_y, own_x, longest
+                    )
             for b in range(size):
                 value[r, first + b] = start + step * place[b]
                 sigma[r, first + b] = information[b]
@@ -283,14 +256,13 @@ def _finish_row(value, sigma, chi2, used, step):  # type: ignore[no-untyped-def]
 
 
 @subkernel
-def _try_surfaces(  # type: ignore[no-untyped-def]
-    table, start, step, order, y, w, item, thickness, slope_y, slope_x, known,
-    y_centre, x_centre, row, column, own_y, own_x, longest,
-):  # fmt: skip
+def _try_surfaces(grid, order, y, w, item, surface, row, column, own_y, own_x, longest):  # type: ignore[no-untyped-def]
     """Best of the surfaces that the cells around a pixel show.
 
     Cells without data show none; only a pixel in such a cell has nothing better to begin with.
     """
+    table, start, step = grid
+    thickness, slope_y, slope_x, y_centre, x_centre, _, known, _ = surface
     guess, votes = np.empty(9, np.float64), np.zeros(9, np.int64)
     number = 0
     for a in range(max(own_y - 1, 0), min(own_y + 2, thickness.shape[0])):

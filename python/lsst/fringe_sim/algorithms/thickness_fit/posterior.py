@@ -11,9 +11,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import Float32Array, FloatArray
 from ...compiled import kernel
 from .newton import score
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _CHANGE = 0.25
 """Relative change of the information within three standard deviations up to which the likelihood is a parabola: its
@@ -30,14 +31,12 @@ _ROUNDS = 30
 """Steps of expectation and maximisation for the share of pixels that lie apart, then good to a few per cent."""
 
 
-def nodes_about(order: float) -> NDArray[np.float64]:
+def nodes_about(order: float) -> FloatArray:
     """Distances of the nodes from the surface, in the unit of ``order``, which is one fringe order."""
     return AWAY * REACH * order
 
 
-def widest_parabola(
-    templates: FringeTemplates, weight: NDArray[np.floating], order_um: float
-) -> NDArray[np.float32]:
+def widest_parabola(templates: FlatTemplates, weight: NDArray[np.floating], order_um: float) -> Float32Array:
     """Largest uncertainty at each thickness, in steps of the table, for which the likelihood is a parabola.
 
     It has to be one over three standard deviations, and these must not reach into the next order. The weights are
@@ -47,10 +46,7 @@ def widest_parabola(
     information = np.gradient(templates.amplitude(), axis=0) ** 2 @ np.asarray(weight, dtype=float)
     limit = np.full(information.shape, reach / 3.0, np.float32)
     for move in range(1, reach + 1):
-        for here, there in (
-            (slice(move, None), slice(None, -move)),
-            (slice(None, -move), slice(move, None)),
-        ):
+        for here, there in ((slice(move, None), slice(None, -move)), (slice(None, -move), slice(move, None))):
             changed = np.abs(information[there] - information[here]) > _CHANGE * information[here]
             limit[here][changed] = np.minimum(limit[here][changed], np.float32(move / 3.0))
     return limit
@@ -62,9 +58,8 @@ def share_apart(chi2: NDArray[np.floating], spread_um: NDArray[np.floating], ord
     That some lie apart is believed if it makes the flats more likely than a free parameter does by itself (Schwarz
     1978, Ann. Stat. 6, 461).
 
-    ``chi2``: of each pixel, at the nodes about the surface, ``(n_pixels, NODES)``; ``spread_um``: standard
-    deviation of the pixels that follow the surface [µm], ``(n_pixels,)``; ``order_um``: thickness of one fringe
-    order [µm].
+    ``chi2``: of each pixel, at the nodes about the surface, ``(n_pixels, NODES)``; ``spread_um``: standard deviation
+    of the pixels that follow the surface [µm], ``(n_pixels,)``.
     """
     if len(chi2) == 0:
         return 1.0
@@ -93,15 +88,13 @@ def chi2_about(value, weight, table, place, away, chi2):  # type: ignore[no-unty
 
 
 @kernel(relaxed=True)
-def settle_band(  # type: ignore[no-untyped-def]
-    amplitude, weight, table, start, step, asked, surface, width, away, share, apart,
-    value, sigma, chi2_out, used,
-):  # fmt: skip
+def settle_band(amplitude, weight, grid, asked, surface, width, away, share, apart, pixels):  # type: ignore[no-untyped-def]
     """Mean and rms of the posterior of the pixels that are ``asked``, in place.
 
     Pixels have a prior of a finite ``width`` about the surface, or lie anywhere within half an order of their own
     value. ``away`` are the nodes in steps of the table, ``share`` what each stands for.
     """
+    (table, start, step), (value, sigma, chi2_out, used) = grid, pixels
     bands, nodes = amplitude.shape[0], away.shape[0]
     y, w = np.zeros((1, table.shape[1]), np.float32), np.zeros((1, table.shape[1]), np.float32)
     chi2, follow = np.empty(nodes, np.float64), np.empty(nodes, np.float64)

@@ -22,7 +22,7 @@ from .lone_surfaces import settle_lone_surfaces
 from .misfit import Misfit, improbability, judge_cells
 from .newton import gauss_newton
 from .pixels import SAME_SURFACE
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 SHIFTS = 3  # Orders above and below that are tried in one round
 _LARGEST_MENDED = 400  # Largest surface, in cells, that is moved onto the one around it, whatever the jump
@@ -51,7 +51,7 @@ class SettledCells:
 
 def settle_orders(
     cells: Cells,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     thickness_um: NDArray[np.float32],
     slope_y: NDArray[np.float32],
     slope_x: NDArray[np.float32],
@@ -132,7 +132,7 @@ def settle_orders(
 
 
 def _judge_cells(
-    cells: Cells, templates: FringeTemplates, thickness: NDArray[np.float32], order: float
+    cells: Cells, templates: FlatTemplates, thickness: NDArray[np.float32], order: float
 ) -> tuple[Misfit, NDArray[np.float64]]:
     """How far cells are off beyond their noise, and how far sums over 1, 2, 4, ... of them err alike."""
     # Whole rows, in which neighbours stay beside each other.

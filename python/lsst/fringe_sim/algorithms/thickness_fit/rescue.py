@@ -10,15 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from ...array_types import Float32Array
 from ...compiled import kernel
 from .amplitudes import Amplitudes
 from .bands import gather_pixels
 from .cells import Cells
-from .evidence import order_evidence
+from .evidence import OrderEvidence, order_evidence
 from .medians import middle_of
 from .newton import gauss_newton
 from .pixels import PixelFit
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 SUSPECT_PROBABILITY = 1e-7  # A pixel whose chi-square is that improbable is not believed
 _FEWEST_TO_SPARE = 6  # A wavelength is left out only of so many or more
@@ -29,7 +30,7 @@ _MOST_SEARCHED = 200_000
 _SAMPLE = 400_000  # Pixels from which the typical misfit is taken
 
 
-def chi2_limits(most: int) -> NDArray[np.float32]:
+def chi2_limits(most: int) -> Float32Array:
     """Reduced chi-square that is exceeded with `SUSPECT_PROBABILITY`, by number of wavelengths 0 ... ``most``."""
     degrees = np.maximum(np.arange(most + 1) - 1, 1)
     return (chdtri(degrees, SUSPECT_PROBABILITY) / degrees).astype(np.float32)
@@ -37,9 +38,9 @@ def chi2_limits(most: int) -> NDArray[np.float32]:
 
 def rescue_pixels(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     pixels: PixelFit,
-    slip: NDArray[np.float32],
+    slip: Float32Array,
     order_um: float,
     *,
     range_um: tuple[float, float],
@@ -47,10 +48,9 @@ def rescue_pixels(
 ) -> PixelFit:
     """Fit again the pixels whose chi-square is improbable.
 
-    ``pixels``: the fit so far; its arrays are revised in place, as a full sensor leaves no room for copies;
-    ``slip``: probability that the order of a pixel is wrong; raised in place where a pixel had to be looked for by
-    itself, float32; ``order_um``: thickness of one fringe order [µm]; ``range_um``: thicknesses that are possible
-    [µm]. Returns them with better values where there are; ``n_wavelengths`` is one less where one was left out.
+    ``pixels``: the fit so far; its arrays are revised in place, as a full sensor leaves no room for copies; ``slip``:
+    probability that the order of a pixel is wrong; raised in place where a pixel had to be looked for by itself,
+    float32. Returns them with better values where there are; ``n_wavelengths`` is one less where one was left out.
     """
     limit = typical_misfit(pixels) * chi2_limits(int(pixels.n_wavelengths.max(initial=0)))
     bad = np.empty(pixels.chi2.shape, np.bool_)
@@ -58,24 +58,21 @@ def rescue_pixels(
     rows, columns = np.nonzero(bad)
     if rows.size == 0:
         return pixels
-    fields = {name: getattr(pixels, name) for name in ("value", "sigma", "chi2", "n_wavelengths")}
-    table = templates.table()
+    grid = templates.grid()
     for low in range(0, rows.size, _MOST_SEARCHED):
         part = slice(low, low + _MOST_SEARCHED)
         value, weight = gather_pixels(data, rows[part], columns[part])
-        _leave_one_out(
-            value, weight, rows[part], columns[part], table, templates.start_um, templates.step_um, order_um,
-            bad, limit, fields["value"], fields["sigma"], fields["chi2"], fields["n_wavelengths"],
-        )  # fmt: skip
+        _leave_one_out(value, weight, rows[part], columns[part], grid, order_um, bad, limit, pixels)
     # Only bad pixels were changed, and only they can still be.
     bad[rows, columns] = pixels.chi2[rows, columns] > limit[pixels.n_wavelengths[rows, columns]]
     compact = bad[rows, columns] & (_bad_neighbours(bad, rows, columns) > _COMPACT * _NEIGHBOURS)
     rows, columns = (index[compact][:_MOST_SEARCHED] for index in (rows, columns))
     if rows.size:
         value, weight = gather_pixels(data, rows, columns)
-        _search_range(
-            value, weight, rows, columns, templates, order_um, range_um, limit, fields, slip, threads
-        )
+        none = np.zeros_like(value)[None]
+        single = Cells(value[None], weight[None], none, none, np.arange(2), np.arange(len(rows) + 1))
+        found = order_evidence(single, templates, order_um, range_um=range_um, threads=threads)
+        _take_what_fits(found, weight, (rows, columns), templates, limit, pixels, slip)
     return pixels
 
 
@@ -117,26 +114,12 @@ def typical_misfit(pixels: PixelFit) -> float:
 
 
 @kernel
-def _leave_one_out(  # type: ignore[no-untyped-def]
-    value,
-    weight,
-    rows,
-    columns,
-    table,
-    start,
-    step,
-    order,
-    bad,
-    limit,
-    thickness,
-    sigma,
-    reduced,
-    used,
-):
+def _leave_one_out(value, weight, rows, columns, grid, order, bad, limit, pixels):  # type: ignore[no-untyped-def]
     """Begin on the surface of the good neighbours, drop the worst wavelength, keep the result if it fits.
 
     Only bad pixels change, and only good ones are looked at as neighbours: the order does not matter.
     """
+    (table, start, step), (thickness, sigma, reduced, used) = grid, pixels
     ny, nx = thickness.shape
     guess = np.empty(49, np.float64)
     for k in range(rows.shape[0]):
@@ -172,23 +155,16 @@ def _leave_one_out(  # type: ignore[no-untyped-def]
             used[y, x] = left
 
 
-def _search_range(
-    value: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    rows: NDArray[np.intp],
-    columns: NDArray[np.intp],
-    templates: FringeTemplates,
-    order_um: float,
-    range_um: tuple[float, float],
-    limit: NDArray[np.float32],
-    fields: dict[str, NDArray[np.generic]],
-    slip: NDArray[np.float32],
-    threads: int,
+def _take_what_fits(
+    found: OrderEvidence,
+    weight: Float32Array,
+    place: tuple[NDArray[np.intp], NDArray[np.intp]],
+    templates: FlatTemplates,
+    limit: Float32Array,
+    pixels: PixelFit,
+    slip: Float32Array,
 ) -> None:
-    """Look for each pixel by itself over the whole range, keep the result if it fits."""
-    none = np.zeros_like(value)[None]
-    single = Cells(value[None], weight[None], none, none, np.arange(2), np.arange(len(rows) + 1))
-    found = order_evidence(single, templates, order_um, range_um=range_um, threads=threads)
+    """Keep what pixels have found by themselves over the whole range, where it fits, in place."""
     used = np.count_nonzero(weight > 0, axis=1)
     reduced = found.chi2[0] / np.maximum(used - 1, 1)
     fits = reduced < limit[used]
@@ -198,8 +174,8 @@ def _search_range(
         2 * margin
     )
     information = (weight[fits, : templates.n_wavelengths] * slope.T**2).sum(axis=1)
-    place = (rows[fits], columns[fits])
-    fields["value"][place] = thickness
-    fields["sigma"][place] = 1.0 / np.sqrt(np.maximum(information, 1e-30))
-    fields["chi2"][place] = reduced[fits]
-    slip[place] = 1.0 - 1.0 / np.maximum(np.exp(-0.5 * found.evidence[0][fits]).sum(axis=1), 1.0)
+    rows, columns = place[0][fits], place[1][fits]
+    pixels.value[rows, columns] = thickness
+    pixels.sigma[rows, columns] = 1.0 / np.sqrt(np.maximum(information, 1e-30))
+    pixels.chi2[rows, columns] = reduced[fits]
+    slip[rows, columns] = 1.0 - 1.0 / np.maximum(np.exp(-0.5 * found.evidence[0][fits]).sum(axis=1), 1.0)

@@ -8,14 +8,14 @@ leave over, then the sum over many pixels says nothing about which of the two is
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import Float32Array, FloatArray
 from .amplitudes import Amplitudes
 from .bands import gather_pixels
 from .cells import Cells
 from .evidence import refine_row
 from .pixels import CellSurface
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _MOST_PIXELS = 4000
 _MOST_PAIRS = 40_000
@@ -27,15 +27,14 @@ _APART = 4.0
 
 
 def doubt_from_shared_misfit(
-    data: Amplitudes, templates: FringeTemplates, thickness_um: NDArray[np.float32], order_um: float
+    data: Amplitudes, templates: FlatTemplates, thickness_um: Float32Array, order_um: float
 ) -> float:
     """Probability that a solution is wrong, if all of its shared misfit has one cause.
 
     The misfit of one pixel in the direction of another order is then as good as that of all: an excess of ``d`` in
     the chi-square of a pixel at another order counts as ``d`` over the shared misfit per degree of freedom.
 
-    ``thickness_um``: thickness of every pixel [µm], float32, ``(ny, nx)``; ``order_um``: thickness of one fringe
-    order [µm].
+    ``thickness_um``: thickness of every pixel [µm], float32, ``(ny, nx)``.
     """
     apart = 1 + int(np.ceil(_APART * data.noise_correlation_px))
     ny, nx = thickness_um.shape
@@ -63,13 +62,13 @@ def doubt_from_shared_misfit(
         inside = (start > templates.start_um) & (start < templates.stop_um)
         if inside.any():
             found = np.full_like(start, np.nan)
-            refine_row(value, weight, templates.table(), templates.start_um, templates.step_um, start, found)
+            refine_row(value, weight, *templates.grid(), start, found)
             excess = (_pull(templates, value, weight, found) ** 2).sum(axis=1) - chi2
             odds += float(np.exp(-0.5 * max(float(excess[inside].mean()), 0.0) / shared))
     return odds / (1.0 + odds)
 
 
-def leaves_only_noise(data: Amplitudes, templates: FringeTemplates, surface: CellSurface) -> bool:
+def leaves_only_noise(data: Amplitudes, templates: FlatTemplates, surface: CellSurface) -> bool:
     """Whether what a model leaves over in neighbouring pixels has nothing in common.
 
     The median over pairs of pixels is not moved by some that have a wrong order.
@@ -86,15 +85,13 @@ def leaves_only_noise(data: Amplitudes, templates: FringeTemplates, surface: Cel
         y, x = (index.ravel() for index in np.meshgrid(rows, columns + shift, indexing="ij"))
         value, weight = gather_pixels(data, y, x)
         found = np.full_like(start, np.nan)
-        refine_row(value, weight, templates.table(), templates.start_um, templates.step_um, start, found)
+        refine_row(value, weight, *templates.grid(), start, found)
         pulls.append(_pull(templates, value, weight, np.nan_to_num(found, nan=templates.start_um)))
         pulls[-1][~np.isfinite(found)] = np.nan
     return _is_noise((pulls[0] * pulls[1]).sum(axis=1))
 
 
-def cells_leave_only_noise(
-    cells: Cells, templates: FringeTemplates, thickness_um: NDArray[np.float32]
-) -> bool:
+def cells_leave_only_noise(cells: Cells, templates: FlatTemplates, thickness_um: Float32Array) -> bool:
     """Whether what a model leaves over in neighbouring cells has nothing in common.
 
     A cell has less noise than its pixels: fringes so weak that no pixel shows them are seen in cells. Taken for the
@@ -107,7 +104,7 @@ def cells_leave_only_noise(
     return _is_noise((pulls[:, 1:] * pulls[:, :-1]).sum(axis=-1).ravel())
 
 
-def _is_noise(product: NDArray[np.float64]) -> bool:
+def _is_noise(product: FloatArray) -> bool:
     """Whether products of neighbours scatter about zero."""
     product = product[np.isfinite(product)]
     if product.size == 0:
@@ -118,11 +115,8 @@ def _is_noise(product: NDArray[np.float64]) -> bool:
 
 
 def _pull(
-    templates: FringeTemplates,
-    value: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    thickness_um: NDArray[np.float32],
-) -> NDArray[np.float64]:
+    templates: FlatTemplates, value: Float32Array, weight: Float32Array, thickness_um: Float32Array
+) -> FloatArray:
     """What a thickness leaves over, in standard deviations, shape ``(n, n_wavelengths)``; 0 without data."""
     wavelengths = templates.n_wavelengths
     miss = value[:, :wavelengths] - templates.amplitude_at(thickness_um).T

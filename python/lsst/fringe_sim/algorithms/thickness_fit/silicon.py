@@ -267,10 +267,7 @@ def _shifted_sum(curves: FloatArray, shift: FloatArray) -> FloatArray:
 
 
 def _minima(
-    scans: list[tuple[FloatArray, FloatArray]],
-    offsets: FloatArray,
-    usable: BoolArray,
-    terms: int,
+    scans: list[tuple[FloatArray, FloatArray]], offsets: FloatArray, usable: BoolArray, terms: int
 ) -> list[FloatArray]:
     """Best local minima over the mean offset, each with its best tilt."""
     totals = np.array([total for total, _ in scans])

@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...array_types import FloatArray
+from ...array_types import Float32Array, FloatArray
 from ...errors import InputError
 from ...model import FringeModel
 from .amplitudes import Amplitudes
-from .templates import FringeTemplates, pad_wavelengths
+from .templates import FlatTemplates, pad_wavelengths
 
 OFFSET = "silicon_thickness.offset"
-SCAN_PER_ORDER = 12
-"""Tables in one order of the silicon of a scan."""
+SCAN_PER_ORDER = 12  # Tables in one order of the silicon of a scan
 NODES_PER_ORDER = 100
 """Thicknesses in one order of the adhesive; linear interpolation is good to 5e-4 of its fringes."""
 
 
-@dataclass(frozen=True, eq=False)
-class SiliconTables:
+class SiliconTables(NamedTuple):
     """Response against the adhesive for several thicknesses of the silicon."""
 
     # response; 0 in the padding, float32, ``(n_silicon, n_thickness, padded wavelengths)``
-    response: NDArray[np.float32]
+    response: Float32Array
     # silicon_start_um, silicon_step_um: first silicon, relative to that of the model, and spacing [µm]
     silicon_start_um: float
     silicon_step_um: float
@@ -74,7 +71,7 @@ class SiliconModel:
         if system.varying == system.detection:
             raise InputError("varying layer", system.varying, "another than the silicon, for a joint fit")
 
-    def templates(self, like: FringeTemplates, offset_um: float) -> FloatArray:
+    def templates(self, like: FlatTemplates, offset_um: float) -> FloatArray:
         """Response on the grid of templates at a thickness of the silicon, ``(n_thickness, n_wavelengths)``."""
         return self.on_grid(offset_um, like.start_um, like.step_um, len(like.response))
 
@@ -119,8 +116,8 @@ class SiliconModel:
 
 
 def silicon_free(
-    data: Amplitudes, templates: FringeTemplates, model: SiliconModel
-) -> tuple[Amplitudes, FringeTemplates]:
+    data: Amplitudes, templates: FlatTemplates, model: SiliconModel
+) -> tuple[Amplitudes, FlatTemplates]:
     """Flats and model for a first fit that does not know the silicon.
 
     The model is averaged over one order of the silicon, and what its fringes do to a flat counts as noise.

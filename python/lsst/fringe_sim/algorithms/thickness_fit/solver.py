@@ -24,7 +24,7 @@ from .nuisances import NuisanceFit, Nuisances, add_offset, patterns_of_cells, su
 from .orders import SURE, solve_orders
 from .pixels import CellSurface
 from .shared_misfit import cells_leave_only_noise, leaves_only_noise
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _MODEL_CHANGE = 0.15  # Change of the model, in rms fringe amplitudes, at which the orders are solved again
 _MOST_SOLUTIONS = 3
@@ -56,7 +56,7 @@ class State:
     slope_y: NDArray[np.float32]
     slope_x: NDArray[np.float32]
     thickness_um: NDArray[np.float32]
-    templates: FringeTemplates
+    templates: FlatTemplates
     nuisance: NuisanceFit
     normalisation: str
     found: OrderEvidence
@@ -85,9 +85,9 @@ class Solver:
     free: Nuisances
     threads: int
     data: Amplitudes
-    base: FringeTemplates | None = None
+    base: FlatTemplates | None = None
 
-    def solve(self, cells: Cells, templates: FringeTemplates) -> State:
+    def solve(self, cells: Cells, templates: FlatTemplates) -> State:
         """Solve the orders, and again if the model turns out to be another than was thought."""
         if not self.free.any:
             return self._solve_held(cells, templates)
@@ -127,7 +127,7 @@ class Solver:
         turns = np.rint(np.nanmedian(apart_um) / self.order_um)
         return bool(np.nanmedian(np.abs(apart_um - turns * self.order_um)) > _SAME_SHAPE * self.order_um)
 
-    def _solve_from(self, nuisance: NuisanceFit, cells: Cells, templates: FringeTemplates) -> Iterator[State]:
+    def _solve_from(self, nuisance: NuisanceFit, cells: Cells, templates: FlatTemplates) -> Iterator[State]:
         """Orders and all that is free in turn, from a first light and contrast: every solution on the way."""
         fitted, alike = nuisance.applied_to(templates), 1.0
         for turn in range(_MOST_SOLUTIONS):
@@ -139,7 +139,7 @@ class Solver:
                 break
             fitted, nuisance, alike = state.templates, state.nuisance, state.alike
 
-    def _described(self, cells: Cells, templates: FringeTemplates) -> tuple[State | None, State | None]:
+    def _described(self, cells: Cells, templates: FlatTemplates) -> tuple[State | None, State | None]:
         """Solution with the model as it is, if that describes the flats, and in any case that of a narrow sensor.
 
         What is free moves no order of the first; the second is one from which all that is free may be learned.
@@ -169,7 +169,7 @@ class Solver:
         fitted = normalise_to_pixels(self.data, state.templates, surface, self.threads)
         return leaves_only_noise(self.data, fitted, surface)
 
-    def _solve_held(self, cells: Cells, templates: FringeTemplates, probe: State | None = None) -> State:
+    def _solve_held(self, cells: Cells, templates: FlatTemplates, probe: State | None = None) -> State:
         """Solve the orders where nothing is free but the mean response; ``probe`` is the first solution if known."""
         nuisance = NuisanceFit.none(templates.n_wavelengths)
         nuisance = replace(nuisance, contrast=templates.contrast)
@@ -201,7 +201,7 @@ class Solver:
         return spans_orders(joined, self.order_um, orders)
 
     @staticmethod
-    def _open_orders(templates: FringeTemplates) -> float:
+    def _open_orders(templates: FlatTemplates) -> float:
         """Orders of thickness up to which the mean response is open."""
         wavelength = templates.wavelength_nm
         bandwidth = max(float(np.ptp(wavelength)) / float(wavelength.mean()), 1e-6)
@@ -225,7 +225,7 @@ class Solver:
     def _state(
         self,
         cells: Cells,
-        templates: FringeTemplates,
+        templates: FlatTemplates,
         nuisance: NuisanceFit,
         normalisation: str,
         range_um: tuple[float, float],
@@ -398,7 +398,7 @@ def surface_of(state: State, order: float) -> CellSurface:
 
 
 def _noise_of_cells(
-    cells: Cells, templates: FringeTemplates, thickness_um: NDArray[np.float32]
+    cells: Cells, templates: FlatTemplates, thickness_um: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Uncertainty of the thickness of each cell from the noise of its mean amplitudes [µm]; infinite if unknown."""
     slope = np.gradient(templates.amplitude(), templates.step_um, axis=0)

@@ -4,19 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...array_types import FloatArray
+from ...array_types import Float32Array, FloatArray
 from ...errors import InputError, OutOfRangeError
 
 LANES = 8  # Wavelength axes are padded to a multiple of this, so that inner loops fill the vector registers
 
 
+class Grid(NamedTuple):
+    """Templates as compiled loops take them."""
+
+    table: Float32Array  # `FlatTemplates.table`
+    # start, step: first thickness and spacing [µm]
+    start: float
+    step: float
+
+
 @dataclass(frozen=True, eq=False)
-class FringeTemplates:
+class FlatTemplates:
     """Response of a stack against thickness, and the amplitudes a flat of that stack would show.
 
     A prepared flat is ``counts / mean - 1`` with the mean over the sensor, so the model is
@@ -118,9 +127,13 @@ class FringeTemplates:
             factor = factor * np.exp(-self.fading * (self.thickness_um - self.middle_um))[:, None]
         return np.asarray(factor * (self.response / self.mean_response - 1.0))
 
-    def table(self) -> NDArray[np.float32]:
+    def table(self) -> Float32Array:
         """`amplitude` as float32 with the wavelength axis padded by zeros to a multiple of `LANES`."""
         return pad_wavelengths(self.amplitude())
+
+    def grid(self) -> Grid:
+        """`table` and the thicknesses of its rows."""
+        return Grid(self.table(), self.start_um, self.step_um)
 
     def amplitude_at(self, thickness_um: ArrayLike) -> FloatArray:
         """Amplitude at any thickness inside the grid, shape ``(n_wavelengths, *thickness.shape)``."""
@@ -269,7 +282,7 @@ class FringeTemplates:
         return float((peak + offset) * self.step_um)
 
 
-def pad_wavelengths(values: NDArray[np.floating]) -> NDArray[np.float32]:
+def pad_wavelengths(values: NDArray[np.floating]) -> Float32Array:
     """Copy to float32 with zeros appended to the last axis up to a multiple of `LANES`."""
     width = values.shape[-1]
     padded = -(-width // LANES) * LANES

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import Float32Array
 from ...compiled import kernel, run_threaded
 from .amplitudes import Amplitudes
 from .bands import BAND_ROWS, load_band
 from .global_fit import GlobalFit
 from .newton import gauss_newton
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _SHIFTS = 4  # Orders on both sides that a lone pixel is compared with
 
 
-def slip_probability(found: GlobalFit, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+def slip_probability(found: GlobalFit, out: Float32Array | None = None) -> Float32Array:
     """Probability that the order of a pixel is wrong, all evidence of a global fit taken together.
 
     Either the whole surface is off, on the summed evidence of its cells; or its cell is, against the neighbours;
@@ -39,17 +39,12 @@ def slip_probability(found: GlobalFit, out: NDArray[np.float32] | None = None) -
 
 
 def lone_slip_probability(
-    data: Amplitudes,
-    templates: FringeTemplates,
-    thickness_um: NDArray[np.float32],
-    order_um: float,
-    threads: int = 2,
-) -> NDArray[np.float32]:
+    data: Amplitudes, templates: FlatTemplates, thickness_um: Float32Array, order_um: float, threads: int = 2
+) -> Float32Array:
     """Probability that the order of a pixel is wrong, on its own amplitudes alone.
 
-    ``thickness_um``: fitted thickness [µm], float32, ``(ny, nx)``; ``order_um``: thickness of one fringe order
-    [µm]. Returns it for a flat prior over four orders on both sides; 1 where there is no thickness, float32,
-    ``(ny, nx)``.
+    ``thickness_um``: fitted thickness [µm], float32, ``(ny, nx)``. Returns it for a flat prior over four orders on
+    both sides; 1 where there is no thickness, float32, ``(ny, nx)``.
     """
     out = np.ones(thickness_um.shape, np.float32)
     table = templates.table()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import BoolArray, Float32Array
 from ...compiled import run_threaded
 from .amplitudes import Amplitudes
 from .bands import BAND_ROWS, gather_pixels, load_band
@@ -13,26 +14,25 @@ from .leaning import Leanings, lean_strip, local_variance
 from .local_surface import LocalSurface, local_surface
 from .pixels import CellSurface, PixelFit
 from .posterior import NODES, SHARE, chi2_about, nodes_about, settle_band, share_apart, widest_parabola
-from .templates import FringeTemplates
+from .templates import FlatTemplates
 
 _MOST_ASKED = 8192  # Pixels that show how many lie apart from their surface
 
 
 def settle_weak_pixels(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     surface: CellSurface,
     cells: Cells,
     pixels: PixelFit,
     order_um: float,
     *,
     threads: int = 2,
-) -> tuple[PixelFit, NDArray[np.bool_]]:
+) -> tuple[PixelFit, BoolArray]:
     """Give pixels that do not tell their thickness by themselves the surface of the cells as a prior.
 
-    ``pixels``: what the pixels found by themselves; its arrays are revised in place; ``order_um``: thickness of one
-    fringe order [µm]. Returns ``pixels``: the revised fit; ``leaning``: pixels that have a surface as their prior,
-    bool, ``(ny, nx)``.
+    ``pixels``: what the pixels found by themselves; its arrays are revised in place. Returns ``pixels``: the revised
+    fit; ``leaning``: pixels that have a surface as their prior, bool, ``(ny, nx)``.
     """
     typical = cells.weight[..., : templates.n_wavelengths].mean(axis=(0, 1))
     weak = _weak(templates, pixels, widest_parabola(templates, typical, order_um))
@@ -53,12 +53,11 @@ def settle_weak_pixels(
     moved = local_variance(seen, np.where(local.holds, variance, 0.0) / step**2, widths, independence)
     width = np.sqrt(np.where(local.holds, variance + step**2 * moved, np.inf)).astype(np.float32)
     width = width[np.ix_(*cell_of)]
-    apart = _share_apart(data, templates, begin, width, order_um)
-    _settle_asked(data, templates, pixels, weak, begin, width, apart, order_um, threads)
+    _settle_asked(data, templates, pixels, weak, begin, width, order_um, threads)
     return pixels, weak & np.isfinite(width)
 
 
-def _weak(templates: FringeTemplates, pixels: PixelFit, limit: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _weak(templates: FlatTemplates, pixels: PixelFit, limit: Float32Array) -> BoolArray:
     """Pixels whose likelihood is no parabola over their uncertainty."""
     place = (pixels.value - templates.start_um) / templates.step_um
     inside = (place >= 0.0) & (place <= len(limit) - 1.0)
@@ -68,15 +67,15 @@ def _weak(templates: FringeTemplates, pixels: PixelFit, limit: NDArray[np.float3
 
 def _leanings(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     cells: Cells,
     local: LocalSurface,
     cell_of_column: NDArray[np.int64],
     threads: int,
-) -> tuple[NDArray[np.float32], Leanings]:
+) -> tuple[Float32Array, Leanings]:
     """The surface at each pixel [µm], and what the pixels of each cell show about it."""
     begin, sums = np.zeros(data.shape[1:], np.float32), np.zeros((4, *cells.shape))
-    table, start, step = templates.table(), templates.start_um, templates.step_um
+    grid = templates.grid()
     away_x = np.arange(data.shape[2]) - cells.x_centre[cell_of_column]
 
     def work(strip: int) -> None:
@@ -84,8 +83,8 @@ def _leanings(
             low, high = int(cells.y_edges[strip]), int(cells.y_edges[strip + 1])
             amplitude, weight = load_band(data, low, high)
             lean_strip(
-                amplitude, weight, table, start, step, local.holds[strip], local.terms[strip], cell_of_column,
-                np.arange(low, high) - cells.y_centre[strip], away_x, begin[low:high], *sums[:, strip],
+                amplitude, weight, grid, local.holds[strip], local.terms[strip], cell_of_column,
+                np.arange(low, high) - cells.y_centre[strip], away_x, begin[low:high], Leanings(*sums[:, strip]),
             )  # fmt: skip
 
     run_threaded(work, cells.shape[0], threads)
@@ -94,37 +93,32 @@ def _leanings(
 
 def _settle_asked(
     data: Amplitudes,
-    templates: FringeTemplates,
+    templates: FlatTemplates,
     pixels: PixelFit,
-    asked: NDArray[np.bool_],
-    surface: NDArray[np.float32],
-    width: NDArray[np.float32],
-    apart: float,
+    asked: BoolArray,
+    surface: Float32Array,
+    width: Float32Array,
     order_um: float,
     threads: int,
 ) -> None:
     """Posterior of some pixels, in place."""
-    table, start, step = templates.table(), templates.start_um, templates.step_um
-    away = nodes_about(order_um / step)
+    apart = _share_apart(data, templates, surface, width, order_um)
+    grid, away = templates.grid(), nodes_about(order_um / templates.step_um)
 
     def work(band: int) -> None:
         part = slice(band * BAND_ROWS, min((band + 1) * BAND_ROWS, len(asked)))
         if asked[part].any():
             amplitude, weight = load_band(data, part.start, part.stop)
             settle_band(
-                amplitude, weight, table, start, step, asked[part], surface[part], width[part], away, SHARE, apart,
-                pixels.value[part], pixels.sigma[part], pixels.chi2[part], pixels.n_wavelengths[part],
+                amplitude, weight, grid, asked[part], surface[part], width[part], away, SHARE, apart,
+                pixels.rows(part),
             )  # fmt: skip
 
     run_threaded(work, -(-len(asked) // BAND_ROWS), threads)
 
 
 def _share_apart(
-    data: Amplitudes,
-    templates: FringeTemplates,
-    surface: NDArray[np.float32],
-    width: NDArray[np.float32],
-    order_um: float,
+    data: Amplitudes, templates: FlatTemplates, surface: Float32Array, width: Float32Array, order_um: float
 ) -> float:
     """Share of pixels apart from their surface that some of those with a surface show."""
     found = np.flatnonzero(np.isfinite(width))
