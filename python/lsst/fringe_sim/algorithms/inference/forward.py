@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.polynomial.hermite_e import hermegauss
 
 from ...array_types import FloatArray
 from ...effects import Effect, ImageGeometry, activate_effects, apply_to_image
@@ -30,6 +32,8 @@ LINE_STEP_NM = 0.1  # Spacing of wavelength nodes [nm]
 
 NUDGE_UM = 1e-3
 """Change of thickness with which effects on the image are differentiated [µm]; they are nearly linear."""
+
+RIM_PLACES = 3  # Places along an axis that stand for a blur where it crosses the rim of an island
 
 MOST_TABLES = 400  # Tables kept for reuse; which of them are there changes no answer
 
@@ -106,7 +110,7 @@ class Forward:
         """The same before effects on the image."""
         everywhere = {key: value for key, value in optical.items() if not self.effect_of(key).local}
         islands = self._model(optical).islands if len(everywhere) < len(optical) else ()
-        covered = [self._covered(item) for item, _ in islands]
+        covered = [self._covered(item, blur_px) for item, _ in islands]
         outside, *on = self._nodes_of_parts(covered, blur_px)
         value, slope = self._looked_up(self.table(everywhere), thickness_um, outside)
         for (item, model), (part, _), nodes in zip(islands, covered, on, strict=True):
@@ -119,22 +123,35 @@ class Forward:
             )
         return value, slope
 
-    def _covered(self, item: ActiveEffect) -> tuple[FloatArray, FloatArray]:
-        """Part of every cell on an island, ``(N,)``, and its moments, ``(5, N)``."""
-        part = item.coverage(self.model.base_system, self.geometry).ravel()
-        moments = item.coverage_moments(self.model.base_system, self.geometry)
-        return part, moments.reshape(len(moments), -1)
+    def _covered(self, item: ActiveEffect, blur_px: float) -> tuple[FloatArray, FloatArray]:
+        """Part of every cell on an island, ``(N,)``, and its moments, ``(5, N)``: means over the reach of a blur."""
+        places, shares = hermegauss(RIM_PLACES) if blur_px else (np.zeros(1), np.ones(1))
+        part, moments = np.zeros(self.geometry.sample_shape), np.zeros((5, *self.geometry.sample_shape))
+        for (j, up), (i, right) in itertools.product(enumerate(blur_px * places), repeat=2):
+            there = replace(self.geometry, y_px=self.geometry.y_px + up, x_px=self.geometry.x_px + right)
+            own = item.coverage(self.model.base_system, there)
+            first_y, first_x, *second = item.coverage_moments(self.model.base_system, there)
+            y, x = up / there.cell_px[0], right / there.cell_px[1]
+            share = shares[j] * shares[i] / shares.sum() ** 2
+            part += share * own
+            moments += share * np.stack([
+                first_y + y * own, first_x + x * own, second[0] + 2.0 * y * first_y + y**2 * own,
+                second[1] + y * first_x + x * first_y + y * x * own, second[2] + 2.0 * x * first_x + x**2 * own,
+            ])  # fmt: skip
+        return part.ravel(), moments.reshape(5, -1)
 
     def _nodes_of_parts(
         self, covered: Sequence[tuple[FloatArray, FloatArray]], blur_px: float
     ) -> list[tuple[FloatArray, FloatArray]]:
-        """Places in thickness outside all islands, and of each; a blur mixes both sides of a rim."""
-        if blur_px or not covered:
-            return [self.shape.nodes(blur_px)] * (1 + len(covered))
-        even = np.array([0.0, 0.0, 1.0, 0.0, 1.0])[:, np.newaxis] / 12.0
+        """Places in thickness outside all islands, and of each."""
+        if not covered:
+            return [self.shape.nodes(blur_px)]
+        down, along = self.geometry.cell_px
+        blurred = np.array([0.0, 0.0, (blur_px / down) ** 2, 0.0, (blur_px / along) ** 2])
+        even = np.array([0.0, 0.0, 1.0, 0.0, 1.0]) / 12.0 + blurred
         parts, moments = zip(*covered, strict=True)
-        rest = 1.0 - np.sum(parts, axis=0), even - np.sum(moments, axis=0)
-        return [self.shape.nodes_of_part(*each) for each in (rest, *covered)]
+        rest = 1.0 - np.sum(parts, axis=0), even[:, np.newaxis] - np.sum(moments, axis=0)
+        return [self.shape.nodes_of_part(*each, blur_px) for each in (rest, *covered)]
 
     def _looked_up(
         self, table: FloatArray, thickness_um: FloatArray, nodes: tuple[FloatArray, ...]

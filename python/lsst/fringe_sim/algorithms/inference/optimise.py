@@ -71,23 +71,20 @@ def effect_columns(point: Point, items: Sequence[Coordinate], secant: float = SE
     shape = (len(items), *point.value.shape)
     values, slopes, phases = np.empty(shape), np.empty(shape), np.empty(len(items))
     forward = point.problem.forward
+    before = forward.log_phase(point.settings)
     for row, item in enumerate(items):
         now = point.settings.get(item.key, item.null)
         step = item.difference(now, secant)
         settings = {**point.settings, item.key: now + step}
-        phase = forward.log_phase(settings) - forward.log_phase(point.settings)
+        phase = forward.log_phase(settings) - before
         follows = bool(phase) and not item.step and secant == SECANT
         moved_um = point.thickness_um * math.expm1(-phase) if follows else 0.0
         value, slope = forward.predict(settings, point.thickness_um + moved_um)
         values[row] = point.whitened((value - point.value) / step)
         slopes[row] = point.whitened((slope - point.slope) / step)
         if follows:
-            up, down = (
-                forward.predict(point.settings, point.thickness_um + sign * moved_um)[1]
-                for sign in (1.0, -1.0)
-            )
             values[row] -= point.steep * moved_um / step
-            slopes[row] -= point.whitened((up - down) / (2.0 * step))
+            slopes[row] -= point.curved * moved_um / step
         phases[row] = phase / step
     return point.columns(values, slopes, phases)
 
