@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover, search
-from lsst.fringe_sim.algorithms.discovery.marginal import verdict
 from lsst.fringe_sim.algorithms.discovery.marginal.accuracy import evidence_within, told_accuracy
 from lsst.fringe_sim.algorithms.discovery.marginal.heldout import Unseen, judge_unseen
-from lsst.fringe_sim.algorithms.discovery.marginal.naming import Naming
 from lsst.fringe_sim.algorithms.discovery.marginal.pace import Pace
 from lsst.fringe_sim.algorithms.discovery.marginal.preparation import Prepared, prepare
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
-from lsst.fringe_sim.algorithms.discovery.marginal.search import SetSearch
 from lsst.fringe_sim.algorithms.discovery.marginal.telling import size_of
 from lsst.fringe_sim.algorithms.inference import Hypothesis, coordinates_of, fit
 from lsst.fringe_sim.effects import EFFECTS, Effect
@@ -178,29 +175,6 @@ def test_what_all_exposures_share_has_its_size(rng: np.random.Generator) -> None
     data = replace(null.problem.data, value=value.reshape(len(value), -1))
     changed = replace(prepared, null=fit((), (), null.problem_with(data)))
     assert size_of(changed)["of_counts"] == pytest.approx(0.02, rel=0.1)
-
-
-@pytest.mark.rng("explained in all data")
-def test_what_is_explained_in_the_part_held_out_counts(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    named, asked = verdict.name_effects, verdict.judge_unseen
-    explained, gains = [], []
-
-    def naming(sets: SetSearch, best: Hypothesis, fall: float, chance: float) -> Naming:
-        explained.append(fall - sets.null.chi2 + best.chi2)
-        return named(sets, best, fall, chance)
-
-    def judged(prepared: Prepared, found: Hypothesis) -> Unseen | None:
-        unseen = asked(prepared, found)
-        gains.append(0.0 if unseen is None else unseen.gain)
-        return unseen
-
-    monkeypatch.setattr(verdict, "name_effects", naming)
-    monkeypatch.setattr(verdict, "judge_unseen", judged)
-    verdict_of(cube_of(rng, flats_of({}) * (1.0 - 0.02 * (X - 0.5) ** 2)), "vignetting")
-    assert explained == pytest.approx([2.0 * gain for gain in gains])
-    assert gains[0] > 1.0
 
 
 @pytest.mark.rng("another significance")

@@ -49,7 +49,7 @@ class Naming:
 def name_effects(sets: SetSearch, best: Hypothesis, explained: float, chance: float) -> Naming:
     """What is said of the effects of the best set.
 
-    ``explained``: χ² that the set takes off the unchanged model, in all data. ``chance``: of noise in what it leaves.
+    ``explained``: χ² that the set takes off the unchanged model. ``chance``: of noise in what it leaves.
     """
     rules, pool = sets.rules, list(sets.pool.values())
     top = sets.posterior(best)

@@ -160,8 +160,7 @@ class MarginalSearch:
         after = self._channels(best)
         self.report(f"data held out are asked about {', '.join(best.effects)}")
         unseen = judge_unseen(self.prepared, best)
-        # The part held out is data too: what effects that were fitted elsewhere explain there counts.
-        explained = self.prepared.null.chi2 - best.chi2 + (2.0 * unseen.gain if unseen is not None else 0.0)
+        explained = self.prepared.null.chi2 - best.chi2
         naming = name_effects(self.sets, best, explained, total_chance(after))
         reasons = []
         if total_chance(after) < self.rules.significance:
