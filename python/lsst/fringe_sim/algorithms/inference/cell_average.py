@@ -78,32 +78,25 @@ class CellShape:
         return self._unblurred if blur_px == 0.0 else self._blurred(blur_px)
 
     def _blurred(self, blur_px: float) -> tuple[FloatArray, FloatArray]:
-        """Places of Gauss and Hermite, bent to the third and fourth cumulant (Cornish & Fisher 1938)."""
-        shift, second, third, fourth = self._moments(blur_px)
-        second = np.maximum(second, LEAST_SPREAD_UM2)
-        skew = np.clip(third / (6.0 * second**1.5), -MOST_BENT[0], MOST_BENT[0])
-        tail = np.clip((fourth / second**2 - 3.0) / 24.0 - 2.0 * skew**2, -MOST_BENT[1], MOST_BENT[1])
-        even = np.sqrt(1.0 - 2.0 * skew**2 - 6.0 * tail**2)
-        x, share = hermegauss(BLURRED_PLACES)
-        x = x[:, np.newaxis]
-        places = np.sqrt(second) * (even * x + skew * (x**2 - 1.0) + tail * (x**3 - 3.0 * x))
-        shares = np.repeat((share / share.sum())[:, np.newaxis], places.shape[1], axis=1)
-        return places + shift, shares
+        return _bent_places(*self._moments(blur_px))
 
     @cached_property
     def _unblurred(self) -> tuple[FloatArray, FloatArray]:
         return _three_places(*self._moments(0.0))
 
-    def nodes_of_part(self, part: FloatArray, moments: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def nodes_of_part(
+        self, part: FloatArray, moments: FloatArray, blur_px: float = 0.0
+    ) -> tuple[FloatArray, FloatArray]:
         """The same as `nodes` of a part of every cell, such as the one that lies on an island.
 
         ``part`` (N,): share of the area. ``moments`` (5, N): means over the cell of y, x, y², yx and x² where the
-        part is and of 0 elsewhere, from the middle of the cell and in units of its side. A cell that is all or none
-        of the part has the places of the whole.
+        part is and of 0 elsewhere, from the middle of the cell and in units of its side. Where there is a blur, both
+        are means over all that it brings to the cell. A cell that is all or none of the part has the places of the
+        whole.
         """
-        places, shares = self._unblurred
+        places, shares = self.nodes(blur_px)
         crossed = np.flatnonzero((part > LEAST_PART) & (part < 1.0 - LEAST_PART))
-        if not crossed.size or not self.area:
+        if not crossed.size or not (self.area or blur_px):
             return places, shares
         y, x, *square = moments[:, crossed] / part[crossed] * self.cell_px
         yy, yx, xx = (self.cell_px * each for each in square)
@@ -113,10 +106,11 @@ class CellShape:
         second = down**2 * yy + 2.0 * down * along * yx + along**2 * xx - mean**2
         second = np.maximum(second, 0.0)
         mean = mean + 0.5 * (bent[0] * yy + 2.0 * bent[1] * yx + bent[2] * xx)
+        blurred = np.minimum(blur_px**2 * (down**2 + along**2), second)
+        fourth = 3.0 * second**2 - (3.0 - UNIFORM) * (second - blurred) ** 2
         places, shares = places.copy(), shares.copy()
-        places[:, crossed], shares[:, crossed] = _three_places(
-            mean, second, np.zeros_like(mean), UNIFORM * second**2
-        )
+        among = _bent_places if blur_px else _three_places
+        places[:, crossed], shares[:, crossed] = among(mean, second, np.zeros_like(mean), fourth)
         return places, shares
 
     def _moments(self, blur_px: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -145,6 +139,21 @@ class CellShape:
         reach = np.abs(self.edge_px) / blur_px
         mean = math.sqrt(2.0 / math.pi) * np.exp(-0.5 * reach**2) + reach * erf(reach / math.sqrt(2.0))
         return blur_px * np.sign(self.edge_px) * (mean - reach), blur_px**2 * (reach**2 + 1.0 - mean**2)
+
+
+def _bent_places(
+    shift: FloatArray, second: FloatArray, third: FloatArray, fourth: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Places of Gauss and Hermite, bent to the third and fourth cumulant (Cornish & Fisher 1938)."""
+    second = np.maximum(second, LEAST_SPREAD_UM2)
+    skew = np.clip(third / (6.0 * second**1.5), -MOST_BENT[0], MOST_BENT[0])
+    tail = np.clip((fourth / second**2 - 3.0) / 24.0 - 2.0 * skew**2, -MOST_BENT[1], MOST_BENT[1])
+    even = np.sqrt(1.0 - 2.0 * skew**2 - 6.0 * tail**2)
+    x, share = hermegauss(BLURRED_PLACES)
+    x = x[:, np.newaxis]
+    places = np.sqrt(second) * (even * x + skew * (x**2 - 1.0) + tail * (x**3 - 3.0 * x))
+    shares = np.repeat((share / share.sum())[:, np.newaxis], places.shape[1], axis=1)
+    return places + shift, shares
 
 
 def _three_places(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.polynomial.hermite_e import hermegauss
 
 from ...array_types import FloatArray
 from ...effects import Effect, ImageGeometry, activate_effects, apply_to_image
@@ -19,6 +22,7 @@ from .cell_average import CellShape, look_up
 
 Settings = Mapping[str, float]
 _Key = tuple[tuple[str, float], ...]
+_Nodes = tuple[FloatArray, FloatArray]
 
 TABLE_STEP_UM = 0.004
 """Spacing of the thickness grid [µm]: 75 per fringe order; cubic interpolation is good to 1e-6."""
@@ -30,6 +34,12 @@ LINE_STEP_NM = 0.1  # Spacing of wavelength nodes [nm]
 
 NUDGE_UM = 1e-3
 """Change of thickness with which effects on the image are differentiated [µm]; they are nearly linear."""
+
+RIM_PLACES = 3  # Places along an axis that stand for a blur where it crosses the rim of an island
+
+PHASE_STEP_NM = 0.5  # Spacing of wavelength nodes where the mean phase of a line is all that is asked [nm]
+
+MOST_PARTS = 4  # Sets of islands whose places are kept for reuse
 
 MOST_TABLES = 400  # Tables kept for reuse; which of them are there changes no answer
 
@@ -53,6 +63,9 @@ class Forward:
     _rows: dict[tuple[_Key, int, float], FloatArray] = field(default_factory=dict, repr=False)
     _by_name: dict[str, Effect] = field(default_factory=dict, repr=False)
     _phases: dict[_Key, float] = field(default_factory=dict, repr=False)
+    _parts: dict[tuple[Any, ...], tuple[list[FloatArray], list[_Nodes]]] = field(
+        default_factory=dict, repr=False
+    )
 
     def __post_init__(self) -> None:
         self._by_name.update({effect.name: effect for effect in self.catalogue})
@@ -106,10 +119,9 @@ class Forward:
         """The same before effects on the image."""
         everywhere = {key: value for key, value in optical.items() if not self.effect_of(key).local}
         islands = self._model(optical).islands if len(everywhere) < len(optical) else ()
-        covered = [self._covered(item) for item, _ in islands]
-        outside, *on = self._nodes_of_parts(covered, blur_px)
+        parts, (outside, *on) = self._parts_of(tuple(item for item, _ in islands), blur_px)
         value, slope = self._looked_up(self.table(everywhere), thickness_um, outside)
-        for (item, model), (part, _), nodes in zip(islands, covered, on, strict=True):
+        for (item, model), part, nodes in zip(islands, parts, on, strict=True):
             own = {f"{item.effect.name}.{name}": x for name, x in item.values.items()}
             places = {f"{item.effect.name}.{name}" for name in item.effect.search.places}
             key = tuple(sorted({**everywhere, **{k: v for k, v in own.items() if k not in places}}.items()))
@@ -119,22 +131,48 @@ class Forward:
             )
         return value, slope
 
-    def _covered(self, item: ActiveEffect) -> tuple[FloatArray, FloatArray]:
-        """Part of every cell on an island, ``(N,)``, and its moments, ``(5, N)``."""
-        part = item.coverage(self.model.base_system, self.geometry).ravel()
-        moments = item.coverage_moments(self.model.base_system, self.geometry)
-        return part, moments.reshape(len(moments), -1)
+    def _parts_of(
+        self, islands: tuple[ActiveEffect, ...], blur_px: float
+    ) -> tuple[list[FloatArray], list[_Nodes]]:
+        """Parts of the cells on islands, and places in thickness outside all and of each; the latest are kept."""
+        values = [(item.effect.name, *sorted(item.values.items())) for item in islands]
+        key = self.shape, blur_px, *values
+        if key not in self._parts:
+            if len(self._parts) >= MOST_PARTS:
+                self._parts.clear()
+            covered = [self._covered(item, blur_px) for item in islands]
+            self._parts[key] = [part for part, _ in covered], self._nodes_of_parts(covered, blur_px)
+        return self._parts[key]
+
+    def _covered(self, item: ActiveEffect, blur_px: float) -> tuple[FloatArray, FloatArray]:
+        """Part of every cell on an island, ``(N,)``, and its moments, ``(5, N)``: means over the reach of a blur."""
+        places, shares = hermegauss(RIM_PLACES) if blur_px else (np.zeros(1), np.ones(1))
+        part, moments = np.zeros(self.geometry.sample_shape), np.zeros((5, *self.geometry.sample_shape))
+        for (j, up), (i, right) in itertools.product(enumerate(blur_px * places), repeat=2):
+            there = replace(self.geometry, y_px=self.geometry.y_px + up, x_px=self.geometry.x_px + right)
+            own = item.coverage(self.model.base_system, there)
+            first_y, first_x, *second = item.coverage_moments(self.model.base_system, there)
+            y, x = up / there.cell_px[0], right / there.cell_px[1]
+            share = shares[j] * shares[i] / shares.sum() ** 2
+            part += share * own
+            moments += share * np.stack([
+                first_y + y * own, first_x + x * own, second[0] + 2.0 * y * first_y + y**2 * own,
+                second[1] + y * first_x + x * first_y + y * x * own, second[2] + 2.0 * x * first_x + x**2 * own,
+            ])  # fmt: skip
+        return part.ravel(), moments.reshape(5, -1)
 
     def _nodes_of_parts(
         self, covered: Sequence[tuple[FloatArray, FloatArray]], blur_px: float
-    ) -> list[tuple[FloatArray, FloatArray]]:
-        """Places in thickness outside all islands, and of each; a blur mixes both sides of a rim."""
-        if blur_px or not covered:
-            return [self.shape.nodes(blur_px)] * (1 + len(covered))
-        even = np.array([0.0, 0.0, 1.0, 0.0, 1.0])[:, np.newaxis] / 12.0
+    ) -> list[_Nodes]:
+        """Places in thickness outside all islands, and of each."""
+        if not covered:
+            return [self.shape.nodes(blur_px)]
+        down, along = self.geometry.cell_px
+        blurred = np.array([0.0, 0.0, (blur_px / down) ** 2, 0.0, (blur_px / along) ** 2])
+        even = np.array([0.0, 0.0, 1.0, 0.0, 1.0]) / 12.0 + blurred
         parts, moments = zip(*covered, strict=True)
-        rest = 1.0 - np.sum(parts, axis=0), even - np.sum(moments, axis=0)
-        return [self.shape.nodes_of_part(*each) for each in (rest, *covered)]
+        rest = 1.0 - np.sum(parts, axis=0), even[:, np.newaxis] - np.sum(moments, axis=0)
+        return [self.shape.nodes_of_part(*each, blur_px) for each in (rest, *covered)]
 
     def _looked_up(
         self, table: FloatArray, thickness_um: FloatArray, nodes: tuple[FloatArray, ...]
@@ -172,7 +210,7 @@ class Forward:
             if len(self._phases) > MOST_TABLES:
                 self._phases.clear()
             system = self._model(everywhere).system
-            light = system.flat_fields(self.geometry.wavelength_nm, LINE_STEP_NM)
+            light = system.flat_fields(self.geometry.wavelength_nm, PHASE_STEP_NM)
             phase = system.reduce(light).kappa[0].real  # of every state but harmonics that were added
             self._phases[key] = float(np.log(np.average(phase, axis=1, weights=light.weight)).mean())
         return self._phases[key]

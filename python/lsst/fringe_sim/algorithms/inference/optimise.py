@@ -71,11 +71,12 @@ def effect_columns(point: Point, items: Sequence[Coordinate], secant: float = SE
     shape = (len(items), *point.value.shape)
     values, slopes, phases = np.empty(shape), np.empty(shape), np.empty(len(items))
     forward = point.problem.forward
+    before = forward.log_phase(point.settings)
     for row, item in enumerate(items):
         now = point.settings.get(item.key, item.null)
         step = item.difference(now, secant)
         settings = {**point.settings, item.key: now + step}
-        phase = forward.log_phase(settings) - forward.log_phase(point.settings)
+        phase = forward.log_phase(settings) - before
         follows = bool(phase) and not item.step and secant == SECANT
         moved_um = point.thickness_um * math.expm1(-phase) if follows else 0.0
         value, slope = forward.predict(settings, point.thickness_um + moved_um)
@@ -181,7 +182,7 @@ def in_best_orders(point: Point, where: BoolArray | None = None, rounds: int = 4
     moves = np.ones(len(point.thickness_um)) if where is None else where.astype(float)
     best, energy = point.thickness_um.copy(), point.cell_energy.copy()
     for shift in SHIFTS:
-        own = point.moved(point.levels, point.thickness_um + shift * order_um * moves)
+        own = point.moved(point.levels, point.thickness_um + shift * order_um * moves) if shift else point
         for number in range(rounds + 1):
             better = own.cell_energy < energy
             best[better], energy[better] = own.thickness_um[better], own.cell_energy[better]

@@ -206,10 +206,13 @@ def _steepest_um(prepared: Prepared) -> float:
 
 def prepare_again(prepared: Prepared, found: Hypothesis, rules: Rules) -> Prepared:
     """Noise, and what pixels see and the thickness does within cells, as judged with effects in the model."""
-    point = _with_likelier_pixels(with_free_contrast(with_common_offset(found.point)), rules)
+    point = with_free_contrast(with_common_offset(found.point))
     cells, noise, problem = _judged(prepared.cells, point, rules)
+    # What pixels see is told by slopes that are right: before, they are those of a wrong model.
+    start = problem.at(point.settings, point.levels, point.thickness_um)
+    point = _with_likelier_pixels(with_free_contrast(start, rounds=4), rules)
     # Every fit may return to the first thickness, whatever has been fitted since.
-    problem = replace(_as_modelled(problem), thickness_um=prepared.problem.thickness_um)
+    problem = replace(_as_modelled(point.problem), thickness_um=prepared.problem.thickness_um)
     null = problem.at({}, prepared.point.levels, prepared.point.thickness_um)
     return replace(
         prepared,

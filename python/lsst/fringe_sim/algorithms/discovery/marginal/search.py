@@ -344,7 +344,8 @@ class SetSearch:
                 effect = self.catalogue.effects[name]
                 sought = effect.search.sought or effect.local
                 one = proposed(effect, items, base) if sought else scorer.score(name, items)
-                found += [one] if one is not None else []
+                if one is not None:
+                    found.append(one)
             self._scores[key] = sorted(found, key=lambda one: -one.gain)
             self._joint[key] = scorer.joint()
         return self._scores[key]
