@@ -261,3 +261,16 @@ def test_no_other_set_is_clearly_likelier(rng: np.random.Generator) -> None:
         ]
         best = max(one.log_evidence for one in every if OPTIONS.is_noise(selector.with_channels(one)))
         assert chosen.log_evidence > best - OPTIONS.class_width
+
+
+@pytest.mark.rng("a level beside the errors that take it in")
+def test_an_effect_is_found_beside_one_of_many_parameters_that_takes_it_in(rng: np.random.Generator) -> None:
+    """Errors that all lie far on one side of zero are likelier with what moves all of them."""
+    some = drawn(rng, 30.0, "one order")
+    errors = some.columns["errors"][0]
+    columns = {"plain": some.columns["plain"], "errors": [errors], "level": [errors.sum(axis=0)[np.newaxis]]}
+    noise = rng.standard_normal(np.prod(SHAPE))
+    for level, names in ((4.0, {"errors", "level"}), (0.0, {"errors"})):
+        data = noise + (level + 0.5 * rng.standard_normal(len(errors))) @ errors
+        chosen, _ = searched(LinearSelector(data, columns))
+        assert set(chosen.names) == names
