@@ -85,6 +85,16 @@ def test_the_order_is_found_from_orders_away(templates: FringeTemplates, moved: 
     assert 0.0 < found.slip < 0.5
 
 
+def test_the_chance_of_another_order_is_that_of_its_margin(templates: FringeTemplates) -> None:
+    """Noise is so large that hardly more than the next best order could be the right one."""
+    free = FREE["light"]
+    cells, _ = cells_of(templates, free, 0.12)
+    found = rank_orders(cells, templates, free, beginning(cells), cells.order_um, (11.6, 17.4))
+    odds = np.exp(-0.5 * found.margin)
+    assert odds > 0.2
+    assert odds / (1.0 + odds) <= found.slip < 2.0 * odds / (1.0 + 2.0 * odds)
+
+
 def test_an_order_beyond_the_thicknesses_that_are_possible_is_not_taken(templates: FringeTemplates) -> None:
     free = FREE["light"]
     cells, truth = cells_of(templates, free, 0.05, 1)
