@@ -187,6 +187,8 @@ def test_silicon_as_the_varying_layer() -> None:
 def test_bad_input(model) -> None:
     with pytest.raises(InputError, match="flats"):
         forecast_flats(model, [], RANGE_UM)
+    with pytest.raises(InputError, match=r"candidate flats.*0.*one or more"):
+        rank_flats(model, flats_at(TEN_NM), [], RANGE_UM)
     with pytest.raises(OutOfRangeError, match="thickness range"):
         forecast_flats(model, flats_at(TEN_NM), (12.0, 7.0))
     with pytest.raises(OutOfRangeError, match="searched"):

@@ -61,6 +61,18 @@ def test_fringes_are_weaker_at_the_edge_of_the_field(centre, thickness_um) -> No
     assert rms[1] < 0.75 * rms[0]
 
 
+def test_the_level_of_the_lines_is_that_of_the_place_in_the_field(thickness_um) -> None:
+    field = AirglowField.imsim()
+    for dx, dy in ((-1.0, 0.4), (0.3, -0.9)):
+        one, still = (
+            CCDFringing(at(dx, dy), BORESIGHT, 5, vary, thickness_um=thickness_um) for vary in (True, False)
+        )
+        expected = float(field.at(dx, dy) / field.at(0.0, 0.0))
+        assert one.fringe_variation_level() == pytest.approx(expected, rel=1e-3)
+        assert abs(expected - 1.0) > 0.01
+        assert still.fringe_variation_level() == 1.0
+
+
 @pytest.mark.slow
 def test_brighter_lines_have_stronger_fringes(centre, thickness_um) -> None:
     """More than the continuum allows they cannot gain: less than the lines themselves."""

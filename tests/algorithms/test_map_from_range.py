@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from foreign_sky import ForeignSky, foreign_map, foreign_night
 
-from lsst.fringe_sim.algorithms.map_from_range import map_from_range
+from lsst.fringe_sim.algorithms.map_from_range import RangeMap, map_from_range
 from lsst.fringe_sim.algorithms.sky_response import sky_response
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, UndeterminedError
 from lsst.fringe_sim.instrument.sky import SkySpectrum
 from lsst.fringe_sim.model import FringeModel, Setup
+from lsst.fringe_sim.products import mask_bits
 
 ORDER_UM, RANGE_UM = 0.3, (13.0, 13.9)
 
@@ -144,3 +145,19 @@ def test_bad_input_is_named():
         map_from_range([blank], [blank[1:]], RANGE_UM, light, ORDER_UM)
     with pytest.raises(UndeterminedError, match="planes"):
         map_from_range([blank], [blank], RANGE_UM, light, ORDER_UM)
+
+
+def test_as_a_product_it_masks_what_is_not_known():
+    known = np.array([[True, False, True]])
+    found = RangeMap(
+        np.array([[13.2, 13.3, 13.4]]), np.array([[0.01, 0.02, 0.03]]), known,
+        order_probability=0.9, apart=0.1, strength=1.0, misfit=1.7, model_error=0.2,
+    )  # fmt: skip
+    product = found.thickness_map("adhesive", "R22_S11")
+    np.testing.assert_array_equal(np.isfinite(product.value), known)
+    np.testing.assert_allclose(product.value[known], [13.2, 13.4], rtol=1e-6)
+    np.testing.assert_allclose(product.sigma[known], [0.01, 0.03], rtol=1e-6)
+    np.testing.assert_array_equal(product.mask, [[0, mask_bits("NO_DATA"), 0]])
+    np.testing.assert_allclose(product.slip_probability, 0.1, rtol=1e-6)
+    np.testing.assert_allclose(product.chi2, 1.7, rtol=1e-6)
+    assert (product.layer, product.detector) == ("adhesive", "R22_S11")

@@ -156,8 +156,10 @@ def test_frames_in_a_file_give_the_same_templates(rng, monkeypatch):
     first = templates_of(images, options)
     monkeypatch.setattr(empirical, "IN_MEMORY", 0)
     monkeypatch.setattr(empirical, "BAND_BYTES", 4 * 4 * 96 * 20)
-    second = templates_of(images, options)
-    np.testing.assert_allclose(second.patterns, first.patterns, atol=1e-3 * first.patterns.std())
+    for rows in (empirical.JUDGED_ROWS, 20):  # all of it, and strips, tell how many templates there are
+        monkeypatch.setattr(empirical, "JUDGED_ROWS", rows)
+        second = templates_of(images, options)
+        np.testing.assert_allclose(second.patterns, first.patterns, atol=1e-3 * first.patterns.std())
 
 
 @pytest.mark.rng("one row per frame")

@@ -1,6 +1,7 @@
 """All public data together: likelihoods against direct integrals, and what each kind of data says by itself."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from lsst.fringe_sim.algorithms.public_evidence.kinds import (
     sky_amplitude,
 )
 from lsst.fringe_sim.algorithms.public_evidence.models import models_with
-from lsst.fringe_sim.algorithms.public_evidence.verdict import compare
+from lsst.fringe_sim.algorithms.public_evidence.verdict import CLASS_WIDTH, PAPER_SILICON, Comparison, compare
 from lsst.fringe_sim.errors import InputError, UnknownNameError
 
 
@@ -169,3 +170,43 @@ def test_the_run_of_the_level_with_thickness_is_no_fringe() -> None:
     )
     assert plain == pytest.approx(0.086, abs=0.005)
     assert absorbing < 0.5 * plain
+
+
+def test_members_of_the_class_are_the_sets_that_are_hardly_less_likely() -> None:
+    behind = np.array([0.0, CLASS_WIDTH - 1e-6, CLASS_WIDTH + 1e-6, 9.0])
+    fits = tuple(SimpleNamespace(log_evidence=-3.0 - each) for each in behind)
+    found = Comparison(fits)  # type: ignore[arg-type]
+    assert found.best is fits[0]
+    assert found.members == fits[:2]
+    assert found.probabilities == pytest.approx(np.exp(-behind) / np.exp(-behind).sum())
+
+
+def test_the_rows_of_a_comparison_say_how_far_each_kind_is_off() -> None:
+    """A thermometer that reads what a set foretells from another one, and what plane layers do not."""
+    kinds = [Thermometer([0.19, 0.2, 0.24]), Thermometer([0.2, 0.2, 0.2], "other")]
+    found = compare([["contrast_loss"]], kinds)
+    row, other = found.rows
+    assert (row.name, other.name) == ("thermometer", "other")
+    assert row.plane == pytest.approx(np.sqrt(np.mean((kinds[0].values - 1.0) ** 2)), abs=1e-3)
+    assert row.paper == pytest.approx(row.plane, abs=1e-3)
+    assert row.foretold == pytest.approx(np.sqrt(np.mean((kinds[0].values - 0.2) ** 2)), abs=0.01)
+    assert row.factor == pytest.approx(row.paper / row.foretold)
+    assert row.log_probability > 5.0
+    best, none = found.fits
+    assert [one.name for one in found.fits] == ["contrast_loss", "none"]
+    assert found.goes_to_the_sky(best) == {"contrast_loss": True}
+    assert found.goes_to_the_sky(none) == {}
+
+
+def test_a_wavelength_is_foretold_with_the_thickness_that_fits_the_others_best() -> None:
+    pixel = PixelFlats.published()
+    found = Comparison((JointFit([], Predictor([pixel])),)).wavelengths
+    assert set(found) == {"paper, as published", "paper, offset and slope free", "none"}
+    amplitudes = pixel.amplitudes(models_with({}, PAPER_SILICON, "total")(pixel.setup), absolute=True)
+    errors = []
+    for left in range(pixel.size):
+        others = [number for number in range(pixel.size) if number != left]
+        misfit = [sum((pixel.values[k] - column[k]) ** 2 for k in others) for column in amplitudes.T]
+        errors.append(pixel.values[left] - amplitudes[left, int(np.argmin(misfit))])
+    assert found["paper, as published"] == pytest.approx(np.sqrt(np.mean(np.square(errors))))
+    assert found["paper, offset and slope free"] != pytest.approx(found["paper, as published"], rel=0.01)

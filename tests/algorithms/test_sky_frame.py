@@ -1,12 +1,14 @@
 """Sky frames against a direct sum over lines and angles, and against laws."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from sky_frames import bright_lines
 
 from lsst.fringe_sim.algorithms.fringe_amplitudes import fringe_amplitudes
+from lsst.fringe_sim.algorithms.island_response import IslandTable
 from lsst.fringe_sim.algorithms.sky_frame import (
     SkyQuadrature,
     simulate_night,
@@ -14,6 +16,7 @@ from lsst.fringe_sim.algorithms.sky_frame import (
     sky_response,
     throughput_electrons,
 )
+from lsst.fringe_sim.effects import ImageGeometry
 from lsst.fringe_sim.errors import InputError, OutOfRangeError, UnknownNameError
 from lsst.fringe_sim.instrument.bandpass import Bandpass
 from lsst.fringe_sim.instrument.night import NightHistory
@@ -255,3 +258,28 @@ def test_continuum_without_lines(monocam):
     only = sky_response(monocam, SkySpectrum(nothing, (airglow_continuum(),)), thickness_range_um=RANGE)
     assert only.component == ("airglow continuum",)
     assert only.bands == ()
+
+
+def test_cells_on_an_island_have_its_light_and_those_of_its_rim_of_both() -> None:
+    """A pixel of which a part is covered has that part of the light of the island."""
+    part = np.array([[0.0, 0.25], [1.0, 0.5]])
+    shapes = []
+
+    def coverage(system: object, geometry: ImageGeometry) -> np.ndarray:
+        shapes.append((geometry.y_px.size, geometry.x_px.size))
+        return part
+
+    tables = [
+        SimpleNamespace(
+            frame=lambda d, slope=slope: (slope * d).astype(np.float32),
+            wavelength_nm=np.array([970.0]),
+            interpolation_error=slope,
+        )
+        for slope in (2.0, 6.0)
+    ]
+    model = SimpleNamespace(base_system=None)
+    table = IslandTable(model, tables[0], ((SimpleNamespace(coverage=coverage), tables[1]),))  # type: ignore[arg-type]
+    thickness = np.array([[13.0, 14.0], [15.0, 16.0]])
+    np.testing.assert_allclose(table.frame(thickness), (2.0 + 4.0 * part) * thickness, rtol=1e-6)
+    assert shapes == [(2, 2)]
+    assert table.interpolation_error == 6.0

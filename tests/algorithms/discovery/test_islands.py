@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from foreign_sky import foreign_map
+from recorded_numbers import Record
 
 from lsst.fringe_sim.algorithms.discovery import islands
-from lsst.fringe_sim.algorithms.discovery.basis import CellBasis
+from lsst.fringe_sim.algorithms.discovery.basis import CellBasis, SplineBasis
 from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
 from lsst.fringe_sim.algorithms.discovery.fit import Fit, Problem, coordinates_of, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare
 from lsst.fringe_sim.algorithms.discovery.selection import Selector
-from lsst.fringe_sim.challenge.sealed_cases import draw_case
+from lsst.fringe_sim.challenge.sealed_cases import draw_case, expose
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.effects import disc_search as discs_module
 from lsst.fringe_sim.effects.disc_search import Discs
@@ -115,3 +119,49 @@ def test_an_island_stays_as_it_is_where_its_order_suits_the_data_better(steep, m
     problem, fit, truth = steep
     monkeypatch.setattr(islands, "continued", lambda field, known: field - problem.order_um)
     np.testing.assert_array_equal(islands.mended_on_islands(problem, fit, truth, truth), truth)
+
+
+def test_a_void_is_found_and_placed_on_its_island(recorded: Record) -> None:
+    """Beside a thickness of each cell, and beside a smooth one, where it looks like a step."""
+    values = {"void.centre_x": 21.3, "void.centre_y": 16.8, "void.radius": 7.4, "void.thickness": 60.0}
+    rng = np.random.default_rng(21)
+    truth = foreign_map(rng, (36, 40), 14.0, 14.4)
+    cube, _ = expose(truth, values, rng)
+    model, cells = FringeModel.from_setup("ts8_e2v"), bin_cube(cube.take(np.arange(0, len(cube.image), 2)), 1)
+    limits = (float(truth.min()) - 1.0, float(truth.max()) + 1.0)
+    (void,) = catalogue = [effect for effect in EFFECTS if effect.name == "void"]
+    forward = Forward.of_cells(model, catalogue, cells, limits)
+    problem = Problem(cells, forward, CellBasis(truth.shape), np.eye(len(cells.value)))
+    own = coordinates_of(void, forward, truth)
+    right = np.array([item.coordinate(values[item.key]) for item in own])
+    on = forward.on_islands(values)
+
+    null = fit_model(problem, (), np.zeros(0), truth.ravel())
+    level, _ = problem.amplitudes(null.levels)
+    selector = Selector(problem, catalogue, null, np.full(len(cells.value), 1.5), generic=False)
+    starts = islands.island_starts(problem, selector.state(null), {}, own, level)
+    place = [number for number, item in enumerate(own) if item.place]
+    assert np.abs(starts[0].position - right)[place].max() < 4.0
+
+    away = right + np.where([item.place for item in own], 0.8, 0.0)
+    placed, thickness = islands.placed_on_island(problem, own, away, truth, level)
+    assert np.abs(placed - right)[place].max() < 0.5
+    assert np.abs(thickness - truth)[on].mean() < 0.01
+    moved = islands.followed_on_island(problem, "void", values, truth + 0.03 * on, level)
+    assert np.abs(moved - truth)[on].mean() < 0.01
+    whole = fit_model(problem, own, right, truth.ravel())
+    unknown = on & (np.indices(truth.shape)[0] % 2 == 0)
+    told = islands.thickness_on_islands(problem, whole, truth + 0.05 * unknown, unknown)
+    assert np.abs(told - truth)[unknown].mean() < 0.01
+
+    smooth = replace(problem, basis=SplineBasis.of_grid(truth.shape, 8.0))
+    field = smooth.basis.fit(truth, cells.seen.astype(float))
+    beside = fit_model(smooth, (), np.zeros(0), field)
+    selector = Selector(smooth, catalogue, beside, np.full(len(cells.value), 1.5), generic=False)
+    steps = [selector.at_step("void", beside, least) for least in (0.0, 1e9)]
+    assert steps[1] is None
+    start = islands.start_at_step(smooth, selector.state(beside), {}, own)
+    recorded({
+        "starts": starts, "placed": placed, "thickness": thickness, "followed": moved, "told": told,
+        "at a step": None if start is None else start, "fit there": steps[0] and steps[0].fit.settings,
+    })  # fmt: skip

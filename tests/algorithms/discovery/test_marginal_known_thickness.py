@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from slow_cases import first_is_quick
@@ -9,6 +11,7 @@ from slow_cases import first_is_quick
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
 from lsst.fringe_sim.algorithms.discovery.marginal.preparation import Prepared, prepare
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
+from lsst.fringe_sim.algorithms.discovery.marginal.smooth import beside_smooth
 from lsst.fringe_sim.algorithms.inference import coordinates_of, fit, jumped, led
 from lsst.fringe_sim.effects import known_effects
 from lsst.fringe_sim.model import FringeModel
@@ -107,3 +110,24 @@ def test_the_answer_is_that_of_the_present_search(effects: dict[str, float], sta
         for key, value in own.parameters.items():
             sigma = np.hypot(value.sigma, other.parameters[key].sigma)
             assert value.value == pytest.approx(other.parameters[key].value, abs=3.0 * sigma)
+
+
+def test_cells_beside_a_known_thickness_say_what_their_data_say() -> None:
+    """Normal errors: the thickness is where data and map meet, and the map has pulled as hard as the data."""
+    shape, rng = (3, 4), np.random.default_rng(1)
+    known, sigma = rng.uniform(14.0, 15.0, 12), rng.uniform(0.01, 0.03, 12)
+    information, own = rng.uniform(100.0, 20_000.0, 12), known + 0.01 * rng.standard_normal(12)
+    seen = np.arange(12) != 5
+    information[~seen] = 0.0
+    total = sigma**-2.0 + information
+    thickness = (known * sigma**-2.0 + own * information) / total
+    problem = SimpleNamespace(
+        known=True, thickness_um=known, thickness_sigma_um=sigma, data=SimpleNamespace(seen=seen),
+        forward=SimpleNamespace(geometry=SimpleNamespace(sample_shape=shape)),
+    )  # fmt: skip
+    point = SimpleNamespace(problem=problem, thickness_um=thickness, thickness_sigma_um=total**-0.5)
+    score, precision = beside_smooth(point)  # type: ignore[arg-type]
+    np.testing.assert_allclose(score.ravel(), information * (own - thickness), atol=1e-9)
+    # The variance of that score where the map has its stated errors.
+    np.testing.assert_allclose(precision.ravel(), information * sigma**-2.0 / total, rtol=1e-9)
+    assert score.shape == precision.shape == shape

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recorded_numbers import Record
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
 from lsst.fringe_sim.algorithms.discovery.marginal.noise import OVERLAP
@@ -76,3 +77,35 @@ def test_the_answer_is_that_of_the_present_search(effects: dict[str, float]) -> 
         for key, value in own.parameters.items():
             sigma = np.hypot(value.sigma, other.parameters[key].sigma)
             assert value.value == pytest.approx(other.parameters[key].value, abs=3.0 * sigma)
+
+
+def test_dim_flats_are_averaged_until_the_thickness_of_a_cell_is_known(recorded: Record) -> None:
+    """Within the error that is stated; the cells are larger than pixels, and the fringes wider than cells."""
+    rng, side = np.random.default_rng(9), 28
+    y, x = np.mgrid[:side, :side] / 36.0
+    thickness = 15.0 + 0.25 * x + 0.15 * y**2 - 0.1 * x * y
+    model = FringeModel.from_setup("ts8_e2v")
+    flats = model.response(thickness, WAVELENGTHS)
+    image = rng.poisson(1500.0 * flats / flats.mean(axis=(1, 2), keepdims=True)).astype(np.float32)
+    rows = FlatExposures(WAVELENGTHS, np.full(12, model.setup.bandwidth_fwhm_nm), np.full(12, 183.15))
+    cube = FringeCube(image, np.maximum(image, 1.0), np.zeros(image.shape, np.int32), rows, "electron")
+    effects = [effect for effect in known_effects(None) if effect.name in ("bandwidth", "contrast_loss")]
+    prepared = prepare(cube, model, effects, 20_000, Rules(), np.random.default_rng(5))
+    size = prepared.cells.cell_px
+    assert size > 1
+    shape = prepared.cells.shape[1:]
+    truth = (
+        thickness[: size * shape[0], : size * shape[1]]
+        .reshape(shape[0], size, shape[1], size)
+        .mean(axis=(1, 3))
+    )
+    pull = ((prepared.free.thickness_um - truth.ravel()) / prepared.free.thickness_sigma_um)[
+        prepared.cells.seen.ravel()
+    ]
+    assert np.abs(np.median(pull)) < 1.0
+    assert np.sqrt(np.mean(pull**2)) < 1.5
+    recorded({
+        "size": size, "thickness": prepared.free.thickness_um, "sigma": prepared.free.thickness_sigma_um,
+        "cost": [prepared.free.cost, prepared.point.cost], "noise": prepared.noise_factor,
+        "levels": prepared.point.levels,
+    })  # fmt: skip

@@ -116,3 +116,21 @@ def test_a_member_that_brings_nothing_where_a_rival_has_led_is_left_out(
     chosen, classes = sets.classified(improved(("coat", "bystander", "light"), Fit), steps)  # type: ignore[arg-type]
     assert chosen.names == tuple(classes) == left
     assert steps == ([left] if len(left) == 2 else [])
+
+
+@pytest.mark.parametrize(("behind", "name"), [(19.0, "leaves noise"), (21.0, "likelier")])
+def test_a_single_effect_that_leaves_noise_may_be_less_likely_by_a_credit(
+    monkeypatch: pytest.MonkeyPatch, behind: float, name: str
+) -> None:
+    assert OPTIONS.credit == 20.0
+    singles = [fitted(("likelier",), 3000.0, MUCH), fitted(("leaves noise",), 3000.0 + 2.0 * behind, NOISE)]
+    known = {one.names: one for one in singles}
+    selector = SimpleNamespace(
+        null=fitted((), NULL_CHI2, MUCH), with_channels=lambda found: found, shifts_phase=lambda found: False,
+        improved=lambda names, base, scan: known[names],
+        problem=SimpleNamespace(cells=SimpleNamespace(n_values=3000)),
+    )  # fmt: skip
+    sets = SetSearch(selector, OPTIONS, lambda text: None, lambda found: found)  # type: ignore[arg-type]
+    monkeypatch.setattr(sets, "step", lambda before, after: after.names)
+    chosen, steps = sets.first(singles)
+    assert chosen.names == steps[0] == (name,)

@@ -101,20 +101,13 @@ class FrameSums:
         coefficient = scipy.linalg.cho_solve(factor, along - mixed @ scale)
         return Solution(scale, coefficient, schur, leakage)
 
-    def products(self, solution: Solution, others: FloatArray | None = None) -> FloatArray:
-        """Sum in each cell of what a solution leaves times each template, shape ``(K, ny, nx)``.
-
-        The templates stand without the background that they resemble, or without a constant each if ``others`` names
-        it.
-        """
+    def products(self, solution: Solution, means: FloatArray) -> FloatArray:
+        """Sum in each cell of what a solution leaves times each template less its mean, shape ``(K, ny, nx)``."""
         left = self._left(solution)
         number = len(self.patterns)
         made = np.zeros((number, *self.pixels.shape))
         for k in range(number):
-            if others is None:
-                beside = -self._on_cells(solution.leakage[:, k])
-            else:
-                beside = -others[k] * self._on_cells(self.background.unity())
+            beside = -means[k] * self._on_cells(self.background.unity())
             other = np.concatenate([beside, np.zeros((*self.pixels.shape, number + 1))], axis=2)
             other[..., TERMS + k] = 1.0
             made[k] = np.einsum("yxm,yxmn,yxn->yx", left, self.matrix, other)
