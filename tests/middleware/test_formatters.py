@@ -83,7 +83,9 @@ def provenance_of(butler: Butler, product: Any, inputs: list[DatasetRef]) -> Any
 
 def test_inputs_are_named_in_the_header(butler: Butler) -> None:
     first = put(butler, MAKERS["FringeFlat"](), "first", "FringeFlat")
-    header = provenance_of(butler, MAKERS["ThicknessMap"](), [first])
+    product = dataclasses.replace(MAKERS["ThicknessMap"](), metadata={"SETUP": "ts8_e2v"})
+    header = provenance_of(butler, product, [first])
+    assert header["SETUP"] == "ts8_e2v"
     assert header["LSST BUTLER N_INPUTS"] == 1
     assert header["LSST BUTLER INPUT 0 ID"] == str(first.id)
     assert header["LSST BUTLER INPUT 0 DATASETTYPE"] == "first"
