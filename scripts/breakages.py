@@ -119,7 +119,10 @@ def _is_other_code(breakage: Breakage) -> bool:
 
 
 def _of_node(node: ast.AST, source: bytes, lines: list[int]) -> Iterator[tuple[int, int, bytes]]:
-    """Places below a node and what stands there instead; no annotations, decorators, defaults, or text."""
+    """Places below a node and what stands there instead; no annotations, decorators, defaults, or text.
+
+    Whether ``zip`` is strict is left alone, too: it changes nothing as long as what it takes is of one length.
+    """
     if isinstance(node, ast.JoinedStr | ast.FunctionDef | ast.ClassDef):
         return  # inner functions have their own turn
 
@@ -156,7 +159,8 @@ def _of_node(node: ast.AST, source: bytes, lines: list[int]) -> Iterator[tuple[i
             )
     for name, child in ast.iter_fields(node):
         for part in child if isinstance(child, list) else [child]:
-            if isinstance(part, ast.AST) and name != "annotation":
+            strict = isinstance(part, ast.keyword) and part.arg == "strict"
+            if isinstance(part, ast.AST) and name != "annotation" and not strict:
                 yield from _of_node(part, source, lines)
 
 
