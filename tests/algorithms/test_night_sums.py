@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.night_levels import background_terms
-from lsst.fringe_sim.algorithms.night_sums import NightSums, Slopes
+from lsst.fringe_sim.algorithms.night_sums import NightSums, ShiftSums
 from lsst.fringe_sim.algorithms.sky_model_error import Envelope
 from lsst.fringe_sim.algorithms.smooth_field import Splines
 
@@ -30,7 +30,7 @@ def test_sums_are_those_of_whole_images(spans: int, with_envelope: bool) -> None
         terms = np.concatenate([terms, envelope.terms(layer, bands)])
     level = rng.standard_normal((FRAMES, len(terms)))
     splines = Splines.of(SHAPE, spans)
-    slopes = Slopes.of(sums, (bands, layer, envelope), level, change, splines)
+    slopes = ShiftSums.of(sums, (bands, layer, envelope), level, change, splines)
     total, gradient = np.zeros((2, *SHAPE))
     for frame in range(FRAMES):
         weighted = terms * weights[frame].ravel()

@@ -69,7 +69,7 @@ class NightSums:
 
 
 @dataclass(frozen=True, eq=False)
-class Slopes:
+class ShiftSums:
     """Sums with the change of the fringes of every frame with a shift."""
 
     # total, gradient: sums over frames of weight times the square of the change, and times change and residual,
@@ -86,7 +86,7 @@ class Slopes:
         level: FloatArray,
         change: FloatArray,
         splines: Splines,
-    ) -> Slopes:
+    ) -> ShiftSums:
         """At the levels ``(F, P)`` of all terms.
 
         ``terms``: bands, thickness [µm], and envelope. ``change``: of the bands with the shift [1/µm].

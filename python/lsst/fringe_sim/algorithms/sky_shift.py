@@ -16,7 +16,7 @@ from ..array_types import FloatArray
 from ..errors import InputError, named_units
 from .correction.objects import square_sums
 from .night_levels import BAND_SIGMA, Predictor, background_terms, levels_of, thinned
-from .night_sums import BACKGROUND, NightSums, Slopes
+from .night_sums import BACKGROUND, NightSums, ShiftSums
 from .sky_model_error import SIZES, Envelope, ModelError
 from .smooth_field import Splines, Spread, nearest_coefficients, prior_covariance
 
@@ -312,7 +312,7 @@ class _Night:
         error, terms = state.error, len(bands) + BACKGROUND
         told = (bands, self.layer_um + state.shift_um, None if error is None else error.envelope)
         used = state.levels if error is not None else state.levels[:, :terms]
-        slopes = Slopes.of(self.sums, told, used, change, splines)
+        slopes = ShiftSums.of(self.sums, told, used, change, splines)
         reduced = np.zeros((splines.count, splines.count))
         shared = np.zeros(1)
         for frame, (inverse, cross) in enumerate(zip(state.inverses, slopes.cross, strict=True)):

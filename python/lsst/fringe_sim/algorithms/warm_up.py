@@ -14,7 +14,7 @@ from ..model.response_table import ResponseTable
 from ..products import FlatExposures, FringeCube
 from .discovery import SearchOptions, discover
 from .field_response import FieldTable
-from .night_sums import NightSums, Slopes
+from .night_sums import NightSums, ShiftSums
 from .sensor_placement import SensorPlacement
 from .sky_frame import simulate_sky_frame, sky_response
 from .sky_model_error import Envelope
@@ -118,7 +118,7 @@ def _night() -> None:
     envelope = Envelope.of(1.0, layer, _ORDER_UM)
     sums = NightSums.of([(bands[0], np.ones(layer.shape))])
     _, side = sums.products(bands, layer, envelope)
-    Slopes.of(sums, (bands, layer, envelope), side, bands, Splines.of(layer.shape, 1))
+    ShiftSums.of(sums, (bands, layer, envelope), side, bands, Splines.of(layer.shape, 1))
 
 
 FIRST = {"thickness of cells and pixels": _fit_cells_and_pixels, "optics and sky": _sky, "night": _night}

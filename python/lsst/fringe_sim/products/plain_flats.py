@@ -36,7 +36,7 @@ OF_LSST = ("LSST_NUM", "RAFTNAME", "RAFTBAY", "TSTAND")  # Keywords of raw frame
 
 
 @dataclass(frozen=True)
-class Part:
+class AmplifierFacts:
     """What belongs to one amplifier, or to all of an image that has no amplifiers of its own."""
 
     gain: float = 1.0  # electrons for each count
@@ -45,7 +45,7 @@ class Part:
     layout: AmplifierLayout | None = None  # where its pixels are, and where they belong; `None` of all pixels
 
     @classmethod
-    def _of(cls, header: DeclaredHeader, layout: AmplifierLayout | None = None) -> Part:
+    def _of(cls, header: DeclaredHeader, layout: AmplifierLayout | None = None) -> AmplifierFacts:
         noise, full = header.value("RDNOISE"), header.value("SATURATE")
         return cls(
             gain=_gain(header),
@@ -74,7 +74,7 @@ class PlainImage:
     wavelength_nm: float | None = None
     temperature_k: float | None = None
     exposure_s: float = 0.0  # 0 where it is not stated
-    parts: tuple[Part, ...] = (Part(),)
+    parts: tuple[AmplifierFacts, ...] = (AmplifierFacts(),)
 
     @classmethod
     def read(cls, path: str | Path) -> PlainImage | None:
@@ -100,7 +100,7 @@ class PlainImage:
         own = {layout.hdu: hdus[layout.hdu].header for layout in layouts}
         # Each amplifier has its own gain and noise, and all have one exposure.
         parts = [
-            Part._of(DeclaredHeader(own[layout.hdu], source, DECLARED, (hdus[0].header,)), layout)
+            AmplifierFacts._of(DeclaredHeader(own[layout.hdu], source, DECLARED, (hdus[0].header,)), layout)
             for layout in layouts
         ]
         header = DeclaredHeader(hdus[0].header, source, DECLARED, tuple(own.values()))
@@ -108,7 +108,7 @@ class PlainImage:
 
     @classmethod
     def _of(
-        cls, header: DeclaredHeader, shape: tuple[int, int], parts: tuple[Part, ...] | None
+        cls, header: DeclaredHeader, shape: tuple[int, int], parts: tuple[AmplifierFacts, ...] | None
     ) -> PlainImage:
         kind = header.text("IMGTYPE").lower() or "flat"
         kind = "bias" if kind in BIASES else "flat" if "flat" in kind else kind
@@ -130,7 +130,7 @@ class PlainImage:
             wavelength_nm=_wavelength(header) if kind == "flat" else None,
             temperature_k=_temperature(header) if kind == "flat" else None,
             exposure_s=seconds,
-            parts=parts or (Part._of(header),),
+            parts=parts or (AmplifierFacts._of(header),),
         )
 
     def require_wavelength_nm(self) -> float:

@@ -43,7 +43,7 @@ RIVALS: tuple[tuple[str, ...], ...] = (
 
 
 @dataclass(frozen=True)
-class Measurement:
+class DecidingMeasurement:
     """One that would tell members of a class apart."""
 
     # name, unit: what is measured
@@ -136,7 +136,7 @@ class Comparison:
         return {fit.name: _on_lsst(fit.best) for fit in self.members}
 
     @cached_property
-    def decisions(self) -> tuple[tuple[Measurement, dict[str, float], float], ...]:
+    def decisions(self) -> tuple[tuple[DecidingMeasurement, dict[str, float], float], ...]:
         """Measurements, what each member expects, and the least separation of two [σ]; the most decisive first."""
         found = []
         for measurement in DECIDING:
@@ -261,28 +261,28 @@ def _silicon_ripple(models: Models) -> float:
 
 
 DECIDING = (
-    Measurement(
+    DecidingMeasurement(
         f"contrast of the adhesive's fringe at 960 nm in a line of {NARROW_NM} nm", "%", 0.05,
         lambda settings: _contrast(_narrow(settings), 960.0),
     ),
-    Measurement(
+    DecidingMeasurement(
         f"silicon fringes from 958 to 962 nm in a line of {NARROW_NM} nm, rms", "%", 0.1,
         lambda settings: _silicon_ripple(_narrow(settings)),
     ),
-    Measurement(
+    DecidingMeasurement(
         "contrast at 960 nm where the adhesive has 21 µm, over 15 µm", "", 0.05,
         lambda settings: _contrast(models_with(settings), 960.0, 21.0)
         / _contrast(models_with(settings), 960.0, 15.0),
     ),
-    Measurement(
+    DecidingMeasurement(
         "contrast at 1000 nm over that at 900 nm", "", 0.05,
         lambda settings: _contrast(models_with(settings), 1000.0) / _contrast(models_with(settings), 900.0),
     ),
-    Measurement(
+    DecidingMeasurement(
         "this very sensor under a y-band sky at f/4, half peak to peak", "%", 0.1,
         lambda settings: sky_amplitude(models_with(settings), "monocam", "half_peak_to_peak"),
     ),
-    Measurement(
+    DecidingMeasurement(
         "LSST sky in the field centre, rms", "%", 0.1,
         lambda settings: sky_amplitude(models_with(settings), "lsst_e2v", "rms"),
     ),

@@ -29,7 +29,7 @@ _LEAST_IN_MEAN = 20_000
 
 
 @dataclass(frozen=True, eq=False)
-class JointFit:
+class AdhesiveAndSilicon:
     """Adhesive of every pixel, and silicon of the sensor."""
 
     pixels: PixelFit  # the adhesive. Its uncertainty contains that of the silicon
@@ -48,7 +48,7 @@ def joint_fit(
     cell_px: int | None = None,
     nuisances: Nuisances | None = None,
     threads: int = 2,
-) -> JointFit:
+) -> AdhesiveAndSilicon:
     """Fit adhesive and silicon.
 
     ``range_um``: thicknesses of the adhesive that are possible [µm]; ``cell_px``: size of the cells on which orders
@@ -62,20 +62,20 @@ def joint_fit(
             free, blurred, range_um=range_um, cell_px=cell_px, nuisances=nuisances, threads=threads
         )
         slip = slip_probability(found, out=found.border_slip)
-        return JointFit(found.pixels, slip, _unknown(search, templates.n_wavelengths), found)
+        return AdhesiveAndSilicon(found.pixels, slip, _unknown(search, templates.n_wavelengths), found)
     del free
     slip = slip_probability(found, out=found.border_slip)
     order = found.order_um
     silicon = find_silicon(data, _believed(found.pixels, slip), model, search, order)
     if not silicon.decided:
-        return JointFit(found.pixels, slip, silicon, found)
+        return AdhesiveAndSilicon(found.pixels, slip, silicon, found)
     if search.degree == 0:
         fixed = replace(templates, response=model.templates(templates, float(silicon.coefficients[0])))
         fixed = replace(fixed, mean_response=fixed.response.mean(axis=0))
         found = global_fit(data, fixed, range_um=range_um, cell_px=cell_px, threads=threads)
         slip = slip_probability(found, out=found.border_slip)
     pixels = _fit_pixels(data, model, silicon, found.pixels, order, threads)
-    return JointFit(pixels, slip, silicon, found)
+    return AdhesiveAndSilicon(pixels, slip, silicon, found)
 
 
 def _unknown(search: SiliconSearch, wavelengths: int) -> SiliconFit:
