@@ -13,7 +13,7 @@ from lsst.fringe_sim.algorithms.thickness_fit.common_order import rank_orders
 from lsst.fringe_sim.algorithms.thickness_fit.learning import learn
 from lsst.fringe_sim.algorithms.thickness_fit.learning_cells import LearningCells
 from lsst.fringe_sim.algorithms.thickness_fit.nuisances import NuisanceFit, Nuisances, light_patterns
-from lsst.fringe_sim.algorithms.thickness_fit.templates import FringeTemplates, pad_wavelengths
+from lsst.fringe_sim.algorithms.thickness_fit.templates import FlatTemplates, pad_wavelengths
 from lsst.fringe_sim.model import FringeModel
 
 WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
@@ -31,13 +31,13 @@ FREE = {
 
 
 @pytest.fixture(scope="module")
-def templates() -> FringeTemplates:
+def templates() -> FlatTemplates:
     made = make_templates(FringeModel.from_setup("ts8_e2v"), WAVELENGTHS, (11.5, 17.5))
     return made.normalised_to(np.linspace(14.0, 14.9, 1001))
 
 
 def cells_of(
-    templates: FringeTemplates, free: Nuisances, noise: float, moved: float = 0.0, off_nm: float = 0.0
+    templates: FlatTemplates, free: Nuisances, noise: float, moved: float = 0.0, off_nm: float = 0.0
 ) -> tuple[LearningCells, np.ndarray]:
     """Cells on light that rises along the columns, some orders away from their thickness, and that thickness."""
     rng = np.random.default_rng(4)
@@ -61,7 +61,7 @@ def beginning(cells: LearningCells) -> NuisanceFit:
 
 
 @pytest.mark.parametrize("moved", [-1, 0, 3])
-def test_the_order_is_found_from_orders_away(templates: FringeTemplates, moved: int) -> None:
+def test_the_order_is_found_from_orders_away(templates: FlatTemplates, moved: int) -> None:
     """Noise is so large that orders beside the right one are not excluded by far."""
     free = FREE["light"]
     cells, truth = cells_of(templates, free, 0.05, moved)
@@ -85,7 +85,7 @@ def test_the_order_is_found_from_orders_away(templates: FringeTemplates, moved: 
     assert 0.0 < found.slip < 0.5
 
 
-def test_the_chance_of_another_order_is_that_of_its_margin(templates: FringeTemplates) -> None:
+def test_the_chance_of_another_order_is_that_of_its_margin(templates: FlatTemplates) -> None:
     """Noise is so large that hardly more than the next best order could be the right one."""
     free = FREE["light"]
     cells, _ = cells_of(templates, free, 0.12)
@@ -95,7 +95,7 @@ def test_the_chance_of_another_order_is_that_of_its_margin(templates: FringeTemp
     assert odds / (1.0 + odds) <= found.slip < 2.0 * odds / (1.0 + 2.0 * odds)
 
 
-def test_an_order_beyond_the_thicknesses_that_are_possible_is_not_taken(templates: FringeTemplates) -> None:
+def test_an_order_beyond_the_thicknesses_that_are_possible_is_not_taken(templates: FlatTemplates) -> None:
     free = FREE["light"]
     cells, truth = cells_of(templates, free, 0.05, 1)
     order = cells.order_um
@@ -105,9 +105,7 @@ def test_an_order_beyond_the_thicknesses_that_are_possible_is_not_taken(template
 
 
 @pytest.mark.parametrize("free", FREE.values(), ids=FREE)
-def test_what_cells_teach_is_as_recorded(
-    templates: FringeTemplates, free: Nuisances, recorded: Record
-) -> None:
+def test_what_cells_teach_is_as_recorded(templates: FlatTemplates, free: Nuisances, recorded: Record) -> None:
     off = float(free.wavelength_accuracy_nm > 0.0)
     cells, truth = cells_of(templates, free, 0.01, off_nm=off)
     thickness, fit = learn(cells, templates, free, beginning(cells), final=True)

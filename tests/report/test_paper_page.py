@@ -8,7 +8,7 @@ import pytest
 
 from lsst.fringe_sim.paper.published import Finding, PublishedNumber
 from lsst.fringe_sim.paper.reproduce import Reproduction
-from lsst.fringe_sim.paper.section import Section
+from lsst.fringe_sim.paper.section import PaperSection
 from lsst.fringe_sim.report.paper_page import write_paper_page
 
 LARGEST = r"largest relative difference of these</dt><dd>"
@@ -35,7 +35,7 @@ def finding(value: float, published: Any, **changes: Any) -> Finding:
 )
 def test_the_largest_relative_difference(findings: list[Finding], stated: str | None, tmp_path: Path) -> None:
     """Of the numbers that differ, where there is something that they are to be compared with."""
-    made = Reproduction((Section("One", "", {}),), (tuple(findings),))
+    made = Reproduction((PaperSection("One", "", {}),), (tuple(findings),))
     page = write_paper_page(made, tmp_path / "paper.html").read_text(encoding="utf-8")
     assert (LARGEST in page) is (stated is not None)
     if stated is not None:
