@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...compiled import kernel, run_threaded, subkernel
 from .cells import Cells
-from .misfit import Misfit, improbability
+from .misfit import Misfit, degrees_of_freedom, improbability
 from .newton import gauss_newton
 from .pixels import SAME_SURFACE
 from .templates import FlatTemplates
@@ -75,6 +75,12 @@ def break_price(jump, order):  # type: ignore[no-untyped-def]
 
 
 @subkernel
+def rise_to_neighbour(rise_y, rise_x, y, x, b, a):  # type: ignore[no-untyped-def]
+    """What the thickness rises by from a cell to one beside it, ``b, a``."""
+    return 0.5 * ((rise_y[y, x] + rise_y[b, a]) * (b - y) + (rise_x[y, x] + rise_x[b, a]) * (a - x))
+
+
+@subkernel
 def _where_neighbours_have_it(thickness, rise_y, rise_x, y, x, near):  # type: ignore[no-untyped-def]
     """Write where the up to four neighbours of a cell would have it; their number."""
     ny, nx = thickness.shape
@@ -83,8 +89,7 @@ def _where_neighbours_have_it(thickness, rise_y, rise_x, y, x, near):  # type: i
         b = y - 1 if side == 0 else (y + 1 if side == 1 else y)
         a = x - 1 if side == 2 else (x + 1 if side == 3 else x)
         if 0 <= b < ny and 0 <= a < nx and np.isfinite(thickness[b, a]):
-            rise = (rise_y[y, x] + rise_y[b, a]) * (b - y) + (rise_x[y, x] + rise_x[b, a]) * (a - x)
-            near[number] = thickness[b, a] - 0.5 * rise
+            near[number] = thickness[b, a] - rise_to_neighbour(rise_y, rise_x, y, x, b, a)
             number += 1
     return number
 
@@ -97,15 +102,6 @@ def _breaks(near, number, thickness, order):  # type: ignore[no-untyped-def]
         price += break_price(near[other] - thickness, order)
         jump = max(jump, abs(near[other] - thickness))
     return price, jump
-
-
-@subkernel
-def _freedom(weight, x):  # type: ignore[no-untyped-def]
-    """Degrees of freedom of a cell whose thickness is fitted."""
-    number = 0
-    for band in range(weight.shape[1]):
-        number += 1 if weight[x, band] > 0.0 else 0
-    return max(number - 1, 1)
 
 
 @kernel
@@ -123,7 +119,7 @@ def _join_row(  # type: ignore[no-untyped-def]
         price, jump = _breaks(near, number, own, order)
         if jump <= SAME_SURFACE * order:
             continue
-        freedom = _freedom(weight, x)
+        freedom = degrees_of_freedom(weight, x)
         place = min(max((own - start) / step, 0.0), top)
         _, _, chi2 = gauss_newton(table, place, value, weight, x, np.int64(3), 0.03 / step)
         least = temper * improbability(chi2, freedom, scale, tail) + price

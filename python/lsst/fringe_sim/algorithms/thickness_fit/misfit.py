@@ -63,6 +63,15 @@ def improbability(chi2, freedom, scale, tail):  # type: ignore[no-untyped-def]
     return (tail + freedom) * np.log1p(max(chi2, 0.0) / (tail * scale))
 
 
+@subkernel
+def degrees_of_freedom(weight, item):  # type: ignore[no-untyped-def]
+    """Degrees of freedom of a cell whose thickness is fitted."""
+    number = 0
+    for band in range(weight.shape[1]):
+        number += 1 if weight[item, band] > 0.0 else 0
+    return max(number - 1, 1)
+
+
 def judge_cells(
     value: NDArray[np.float32],
     weight: NDArray[np.float32],

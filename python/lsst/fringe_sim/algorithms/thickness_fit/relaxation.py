@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...compiled import kernel, run_threaded, subkernel
-from .between_orders import Rises, break_price, join_neighbours
+from .between_orders import Rises, break_price, join_neighbours, rise_to_neighbour
 from .cells import Cells, cell_independence, effective_number
 from .evidence import EVIDENCE_CAP, IMPOSSIBLE, OrderEvidence
 from .lone_surfaces import settle_lone_surfaces
-from .misfit import Misfit, improbability, judge_cells
+from .misfit import Misfit, degrees_of_freedom, improbability, judge_cells
 from .newton import gauss_newton
 from .pixels import SAME_SURFACE
 from .templates import FlatTemplates
@@ -142,15 +142,6 @@ def _judge_cells(
     return judge_cells(value, weight, templates, thickness[some][known], order)
 
 
-@subkernel
-def _used(weight, item):  # type: ignore[no-untyped-def]
-    """Number of wavelengths of a cell."""
-    number = 0
-    for band in range(weight.shape[1]):
-        number += 1 if weight[item, band] > 0.0 else 0
-    return number
-
-
 @kernel
 def _surfaces(thickness, rise_y, rise_x, limit):  # type: ignore[no-untyped-def]
     """Number of the connected surface each cell lies on, in the order of their first cells; -1 without data."""
@@ -162,10 +153,8 @@ def _surfaces(thickness, rise_y, rise_x, limit):  # type: ignore[no-untyped-def]
                 b, a = (y - 1, x) if side == 0 else (y, x - 1)
                 if b < 0 or a < 0:
                     continue
-                rise = (
-                    0.5 * (rise_y[y, x] + rise_y[b, a]) if side == 0 else 0.5 * (rise_x[y, x] + rise_x[b, a])
-                )
-                if abs(thickness[y, x] - thickness[b, a] - rise) < limit:
+                rise = rise_to_neighbour(rise_y, rise_x, y, x, b, a)
+                if abs(thickness[b, a] - thickness[y, x] - rise) < limit:
                     first, second = _top(parent, y * nx + x), _top(parent, b * nx + a)
                     parent[max(first, second)] = min(first, second)
     number = np.full(ny * nx, -1, np.int64)
@@ -203,7 +192,7 @@ def _ask_row(  # type: ignore[no-untyped-def]
         if not np.isfinite(thickness[c]):
             continue
         least = np.inf
-        freedom = max(_used(weight, c) - 1, 1)
+        freedom = degrees_of_freedom(weight, c)
         for k in range(shifts):
             at = thickness[c] + (k - shifts // 2) * order
             if at < low - 0.05 * order or at > high + 0.05 * order:
@@ -242,9 +231,7 @@ def _border_price(shifted, label, rise_y, rise_x, order, y, x, move, top, bottom
             continue
         there = shifted[b, a, label[b, a] + middle]
         if np.isfinite(there):
-            rise = 0.5 * (rise_y[y, x] + rise_y[b, a]) * (b - y) + 0.5 * (rise_x[y, x] + rise_x[b, a]) * (
-                a - x
-            )
+            rise = rise_to_neighbour(rise_y, rise_x, y, x, b, a)
             total += break_price(there - here - rise, order)
     return total
 
@@ -340,9 +327,7 @@ def _segment_borders(shifted, label, segment, rise_y, rise_x, order, count):  # 
                     continue
                 if segment[y, x] < 0 or segment[b, a] < 0:
                     continue
-                rise = (
-                    0.5 * (rise_y[y, x] + rise_y[b, a]) if side == 0 else 0.5 * (rise_x[y, x] + rise_x[b, a])
-                )
+                rise = rise_to_neighbour(rise_y, rise_x, y, x, b, a)
                 jump = shifted[b, a, label[b, a] + middle] - shifted[y, x, label[y, x] + middle] - rise
                 for k in range(shifts):
                     price[segment[y, x], k] += break_price(jump - (k - middle) * order, order)
