@@ -155,7 +155,9 @@ class Forward:
         """Cells ``(W, N)``, each at its own place, from those of all places ``(K * W, N)``."""
         if self.place_weight is None:
             return rows
-        return np.asarray(np.einsum("kn,kwn->wn", self.place_weight, rows.reshape(-1, self.waves, rows.shape[1])))
+        return np.asarray(
+            np.einsum("kn,kwn->wn", self.place_weight, rows.reshape(-1, self.waves, rows.shape[1]))
+        )
 
     def _on_image(self, settings: Settings, value: FloatArray) -> FloatArray:
         active = activate_effects(settings, self.catalogue)

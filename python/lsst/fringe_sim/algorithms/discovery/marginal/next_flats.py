@@ -132,7 +132,9 @@ class FlatForecast:
                 asked.append((forward.predict(moved, there)[0] - other) / step)
         if series is None:
             weight = own.problem.data.weight[:, order] * own.levels[:, np.newaxis] ** 2
-            weight = np.resize(weight, (len(value), len(order)))  # further frames have the noise of those there
+            weight = np.resize(
+                weight, (len(value), len(order))
+            )  # further frames have the noise of those there
         else:
             weight = np.full((len(value), len(order)), series.level_e * self.cells.cell_px**2)
         weight = weight * (own.problem.data.seen.sum() / len(order))

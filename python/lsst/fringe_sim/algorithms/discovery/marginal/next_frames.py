@@ -1,7 +1,7 @@
-"""Which further data would tell effects apart that frames of the sky have left in one class, as `..next_frames` has it.
+"""Which further data would tell effects apart that frames of the sky have left in one class; see `..next_frames`.
 
-Further frames are of the same cells. Flats of the laboratory have levels, a thickness and a response of their own, and
-their information adds up with that of the sky.
+Further frames are of the same cells. Flats of the laboratory have levels, a thickness and a response of their own,
+and their information adds up with that of the sky.
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ class FrameForecast(FlatForecast):
         )
         present = self._information([here])
         for measurement, model in laboratory_flats(self.model):
-            flats = self._seen(self._of_laboratory(model, measurement.series), measurement.series, name, rivals)
+            flats = self._seen(
+                self._of_laboratory(model, measurement.series), measurement.series, name, rivals
+            )
             yield measurement, present + self._information([flats], alone)
 
     def _of_twice_as_many(self, exposures: Exposures) -> Forward:

@@ -43,7 +43,8 @@ from .telling import data_of, rms_left, size_of, steps_of
 class MarginalSearch:
     """One search of exposures by one log marginal likelihood, and how its answer is put.
 
-    Parameters are those of `search_exposures`; thickness and noise are fitted with the unchanged model when it is made.
+    Parameters are those of `search_exposures`; thickness and noise are fitted with the unchanged model when it is
+    made.
     """
 
     def __init__(
