@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,11 +10,21 @@ import pytest
 from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
+from lsst.fringe_sim.algorithms.discovery.marginal.noise import measured_noise
 from lsst.fringe_sim.algorithms.discovery.marginal.preparation import Prepared, prepare
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
 from lsst.fringe_sim.algorithms.discovery.marginal.smooth import beside_smooth
-from lsst.fringe_sim.algorithms.inference import coordinates_of, fit, jumped, led
-from lsst.fringe_sim.effects import known_effects
+from lsst.fringe_sim.algorithms.inference import (
+    CellShape,
+    Data,
+    Forward,
+    Problem,
+    coordinates_of,
+    fit,
+    jumped,
+    led,
+)
+from lsst.fringe_sim.effects import ImageGeometry, known_effects
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FlatExposures, FringeCube
 
@@ -84,6 +95,43 @@ def test_a_derivative_leads_to_a_phase_that_is_far(rng: np.random.Generator) -> 
     assert found.point.settings[offset.key] == pytest.approx(0.012, abs=2e-4)
     away = found.point.thickness_um - point.problem.thickness_um
     assert np.abs(away).max() < 6.0 * STATED_UM  # no cell is in another order
+
+
+@pytest.mark.rng("cells that are held out beside a map")
+def test_cells_that_are_held_out_lie_where_the_map_has_them(rng: np.random.Generator) -> None:
+    cube = cube_of(rng, {})
+    assert cube.thickness is not None
+    cube = replace(
+        cube, thickness=cube.thickness + rng.normal(0.0, 0.05, cube.thickness.shape)
+    )  # it is rough
+    prepared = prepared_of(cube)
+    unseen = prepared.unseen
+    assert unseen.thickness_um is not None
+    first = prepared.problem.thickness_um.reshape(unseen.shape[1:])
+    np.testing.assert_allclose(first[unseen.seen], unseen.thickness_um[unseen.seen], atol=1e-9)
+
+
+@pytest.mark.rng("errors of a map as large as noise")
+def test_a_map_that_followed_its_noise_leaves_all_of_it(rng: np.random.Generator) -> None:
+    """With few exposures, and errors of a map that do to them what noise does, a part of which the fit takes."""
+    waves, side, electrons, sigma_um = np.array([900.0, 901.0]), 48, 20_000.0, 0.008
+    place = np.arange(float(side))
+    field = 14.0 + 0.02 * place + 0.01 * place[:, np.newaxis]
+    geometry = ImageGeometry((side, side), place, place, waves, np.full(2, electrons))
+    model = FringeModel.from_setup("ts8_e2v")
+    forward = Forward(model, (), geometry, CellShape.of_field(field, 1), (13.2, 16.3))
+    truth = field.ravel()
+    value, slope = forward.predict({}, truth)
+    data = Data(value + electrons**-0.5 * rng.standard_normal(value.shape), np.full(value.shape, electrons))
+    measured = truth + sigma_um * rng.standard_normal(truth.shape)
+    problem = Problem(data, forward, measured, 1e-6, np.full(truth.shape, sigma_um), known=True)
+    point = fit((), (), problem.at({}, np.ones(2), measured)).point
+    error = 1.0 / np.sqrt(2.0 * value.size)
+    assert 0.3 < (slope**2).mean() * electrons * sigma_um**2 < 3.0
+    assert point.misfit(2) == pytest.approx(1.0, abs=5.0 * error)
+    factor, scatter = measured_noise(point, (2, side, side))
+    assert factor.mean() == pytest.approx(1.0, abs=0.05)
+    assert scatter < 0.4 * electrons**-0.5
 
 
 @pytest.mark.slow

@@ -53,8 +53,8 @@ def discover(
         metavar="PART",
     ),
     core: str = option(
-        "Which search of flats: the present one, or an experimental one on one likelihood, which cannot do "
-        "everything yet and may change in any version.",
+        "Which search: the present one, or an experimental one on one likelihood, which cannot do everything "
+        "yet and may change in any version.",
         "present",
         click.Choice(["present", "marginal"]),
     ),
@@ -96,7 +96,7 @@ def discover(
             click.echo(f"would search {len(data.sky.frames)} frames of {columns} x {rows} pixels")
             return
         model = data.model(sky_settings(effects.settings))
-        _search_sky(data, model, placement, out, seed, replace(SKY_SEARCH, **limits), given)
+        _search_sky(data, model, placement, out, seed, replace(SKY_SEARCH, core=core, **limits), given)
         return
     if thickness is not None:
         raise InputError("--thickness", thickness, "only with the set-up of a telescope, as lsst_e2v")

@@ -19,6 +19,7 @@ from ...products.mask import mask_bits
 from ..flat_prep_options import GAUSSIAN_MAD
 
 LEAST_FILLED = 0.75  # Smallest part of good pixels with which a cell is used
+UNSTATED_UM = 0.01  # Error of a thickness map that states none [µm]
 
 BAD_PLANES = mask_bits("BAD", "SAT", "INTRP", "CR", "EDGE", "SUSPECT", "NO_DATA")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from ...compiled import contiguous, kernel, run_shares, subkernel
 from ...effects import ActiveEffect, Effect, ImageGeometry, activate_effects, apply_to_image
 from ...model import FringeModel
 from ...optics.illumination import Illumination
+from ..exposures import Exposures
 from .cells import CellData
 from .evaluations import note_evaluation
 from .slopes import Slopes
@@ -50,22 +51,6 @@ class Prediction:
 
     value: FloatArray  # (W, ny, nx): signal relative to its mean over the thicknesses of the tables
     slope: FloatArray  # (W, ny, nx): its derivative with respect to thickness [1/µm]
-
-
-class Exposures(Protocol):
-    """The light of the exposures, where it is not that of flats."""
-
-    def response(self, model: FringeModel, start_um: float, step_um: float, count: int) -> FloatArray:
-        """Response of every exposure at K places of the field on a uniform grid of thickness, in any unit.
-
-        Shape ``(K * W, count)``, all exposures at one place after the other.
-        """
-
-    def place_weight(self, geometry: ImageGeometry) -> FloatArray:
-        """Weights of the places for every cell, ``(K, ny, nx)``; their sum is 1."""
-
-    def further(self) -> Sequence[tuple[str, str, Exposures]]:
-        """Exposures that could be taken: a key, what to take, the present ones with as many of those behind them."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ import numpy as np
 
 from ...array_types import FloatArray
 from ...model import FringeModel, Setup, setup_names
+from ..exposures import Exposures
 from ..measurement_forecast import RESPONSE_SCATTER
 from ..next_measurement import FlatMeasurement, FlatSeries, Measurement, PairForecast, RankedMeasurement
 from .cells import CellData
@@ -28,7 +29,7 @@ from .fit import (
     linearise_at,
     solve_symmetric,
 )
-from .forward import Exposures, Forward
+from .forward import Forward
 from .next_step import Values
 
 
@@ -67,7 +68,7 @@ class FrameForecast:
         for key, title, exposures in forward.exposures.further():
             problem = _of_twice_as_many(self.problem, exposures)
             found.append((Measurement(key, title), self._information(problem, name, rivals)))
-        for measurement, laboratory in _laboratory_flats(forward.model):
+        for measurement, laboratory in laboratory_flats(forward.model):
             problem = _of_flats(self.problem, laboratory, measurement.series)
             found.append((measurement, present + self._information(problem, name, rivals)))
         return found
@@ -115,7 +116,8 @@ def laboratory_of(setup: Setup) -> Setup | None:
     return max(own, key=lambda each: len(each.wavelengths_nm), default=None)
 
 
-def _laboratory_flats(model: FringeModel) -> list[tuple[FlatMeasurement, FringeModel]]:
+def laboratory_flats(model: FringeModel) -> list[tuple[FlatMeasurement, FringeModel]]:
+    """Flats that the laboratory of a sensor on the sky would take of it, and its model there; none without one."""
     setup = laboratory_of(model.setup)
     if setup is None:
         return []

@@ -15,11 +15,12 @@ from ...effects import Effect
 from ...errors import InputError
 from ...model import FringeModel
 from ...products.fringe_cube import FringeCube
+from ..exposures import Exposures
 from .basis import CellBasis, FieldBasis, SplineBasis
-from .cells import CellData, bin_cube, finest_useful_cell
+from .cells import UNSTATED_UM, CellData, bin_cube, finest_useful_cell
 from .comparison import chi2_with_free_fringes, fringe_order_um
 from .fit import Fit, Problem, fit_model, linearise_at
-from .forward import Exposures, Forward
+from .forward import Forward
 from .growth import fitted_smooth, grown_thickness
 from .islands import mended_on_islands
 from .noise import STATED_UNCERTAINTY, NoiseEstimate, estimate_noise, map_variance_share, noise_ratio
@@ -501,7 +502,7 @@ def _prepare_known(
     """Data with a thickness map: the field may move only within its uncertainty."""
     assert cells.thickness_um is not None
     known = np.where(np.isfinite(cells.thickness_um), cells.thickness_um, np.nanmedian(cells.thickness_um))
-    sigma = 0.01 if cells.thickness_sigma_um is None else float(np.nanmedian(cells.thickness_sigma_um))
+    sigma = UNSTATED_UM if cells.thickness_sigma_um is None else float(np.nanmedian(cells.thickness_sigma_um))
     range_um = (float(known.min()) - 0.5, float(known.max()) + 0.5)
     forward = Forward.of_cells(model, effects, cells, range_um, exposures)
     basis = CellBasis(known.shape)

@@ -16,13 +16,13 @@ from ...effects import Effect, known_effects
 from ...model import FringeModel, Setup
 from ...products.fringe_cube import FringeCube
 from ...products.sky_frame import refuse_noiseless
+from ..exposures import Exposures
 from .accuracy import ACCURACY_SOURCE, MODEL_ACCURACY, chance_within_accuracy
 from .channels import Channel, in_looks
 from .classes import EffectClass, classes_in_all_data, outsider_probability
 from .describe import describe_residual, disagreement
 from .evaluations import OutOfTimeError, time_limit
 from .fit import Fit, fit_model
-from .forward import Exposures
 from .hidden_islands import hidden_island
 from .lesson import evidence_of_correction, learned_beside
 from .neighbours import not_replaced
@@ -141,13 +141,13 @@ def search_exposures(
             return _no_answer(model, poor, cube)
         begun, budget = time.monotonic(), chosen.time_budget_s
         search: _Search | MarginalSearch | None = None
-        left_to_present = _why_not_marginal(cube, exposures)
+        left_to_present = _why_not_marginal(cube)
         try:
             with time_limit(begun + (1.0 - FOR_JUDGEMENT) * budget):
                 if chosen.core == "marginal" and not left_to_present:
                     from .marginal import MarginalSearch  # is made of parts of this package
 
-                    search = MarginalSearch(cube, model, effects, rng, chosen, say)
+                    search = MarginalSearch(cube, model, effects, rng, chosen, say, exposures)
                     return search.run()
                 say("fitting the thickness with the unchanged model")
                 prepared = prepare(cube, model, effects, chosen.most_cells, exposures)
@@ -168,10 +168,8 @@ and one that is held out, and measure the noise of both: 16 leave as many second
 held out as `marginal.noise` asks for, 12 do not."""
 
 
-def _why_not_marginal(cube: FringeCube, exposures: Exposures | None) -> str:
+def _why_not_marginal(cube: FringeCube) -> str:
     """Why the search on one likelihood cannot search such data, or nothing."""
-    if exposures is not None:
-        return "light of the sky"
     if min(cube.shape[1:]) < MARGINAL_ROWS:
         return f"fewer than {MARGINAL_ROWS} rows or columns of pixels"
     return ""

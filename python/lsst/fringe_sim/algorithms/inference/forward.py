@@ -18,6 +18,7 @@ from ...effects.active import ActiveEffect, another
 from ...model import FringeModel
 from ...optics.illumination import Illumination
 from ..discovery.evaluations import note_evaluation
+from ..exposures import Exposures
 from .cell_average import CellShape, look_up
 
 Settings = Mapping[str, float]
@@ -59,6 +60,9 @@ class Forward:
     contrast: float = (
         1.0  # contrast of the fringes over that of the model; 1 but while noise and cells are judged
     )
+    exposures: Exposures | None = None  # the light, monochromator flats by default
+    # weights of the places of the field whose light is known, for every cell, ``(K, N)``; one place by default
+    place_weight: FloatArray | None = None
     _tables: dict[_Key, FloatArray] = field(default_factory=dict, repr=False)
     _rows: dict[tuple[_Key, int, float], FloatArray] = field(default_factory=dict, repr=False)
     _by_name: dict[str, Effect] = field(default_factory=dict, repr=False)
@@ -177,10 +181,21 @@ class Forward:
     def _looked_up(
         self, table: FloatArray, thickness_um: FloatArray, nodes: tuple[FloatArray, ...]
     ) -> tuple[FloatArray, FloatArray]:
-        value, slope = look_up(table, self.range_um[0], TABLE_STEP_UM, thickness_um, nodes)
+        value, slope = (
+            self._at_places(rows)
+            for rows in look_up(table, self.range_um[0], TABLE_STEP_UM, thickness_um, nodes)
+        )
         if self.centroid is not None:
             value = value + slope * np.einsum("an,awn->wn", self.shape.gradient, self.centroid)
         return value, slope
+
+    def _at_places(self, rows: FloatArray) -> FloatArray:
+        """Cells ``(W, N)``, each at its own place, from those of all places ``(K * W, N)``."""
+        if self.place_weight is None:
+            return rows
+        return np.asarray(
+            np.einsum("kn,kwn->wn", self.place_weight, rows.reshape(-1, self.waves, rows.shape[1]))
+        )
 
     def _on_image(self, settings: Settings, value: FloatArray) -> FloatArray:
         active = activate_effects(settings, self.catalogue)
@@ -225,27 +240,37 @@ class Forward:
         return math.ceil((self.range_um[1] - self.range_um[0]) / TABLE_STEP_UM) + 1
 
     def table(self, settings: Settings) -> FloatArray:
-        """Response ``(W, D)`` on the grid of thickness over its tapered mean, of effects that are everywhere."""
+        """Response ``(W, D)`` on the grid of thickness over its tapered mean, of effects that are everywhere.
+
+        Light that changes over the field has such rows for each of its places, ``(K * W, D)``.
+        """
         key = tuple(sorted(settings.items()))
         if key not in self._tables:
-            self._keep(key, self._over_mean(self._response(settings)))
+            response = self._response(settings)
+            self._keep(key, response / self._level(response))
         return self._tables[key]
 
     def _island_table(self, key: _Key, everywhere: Settings, model: FringeModel) -> FloatArray:
         """The same where a local effect is, over the mean of all other places."""
         if key not in self._tables:
-            light = model.system.flat_fields(self.geometry.wavelength_nm, LINE_STEP_NM)
-            outside = self._response(everywhere)
-            level = np.average(outside, axis=1, weights=self._taper)
-            self._keep(key, self._grid_response(model, light, slice(None)) / level[:, np.newaxis])
+            self._keep(key, self._fresh(model) / self._level(self._response(everywhere)))
         return self._tables[key]
 
     @property
     def _taper(self) -> FloatArray:
         return np.hanning(self._count + 2)[1:-1]
 
-    def _over_mean(self, response: FloatArray) -> FloatArray:
-        return np.asarray(response / np.average(response, axis=1, weights=self._taper)[:, np.newaxis])
+    def _level(self, response: FloatArray) -> FloatArray:
+        """Mean level of the rows of a table, that of all places, ``(rows, 1)``."""
+        mean = np.average(response, axis=1, weights=self._taper).reshape(-1, self.waves).mean(axis=0)
+        return np.resize(mean, len(response))[:, np.newaxis]
+
+    def _fresh(self, model: FringeModel) -> FloatArray:
+        """Response of all exposures on the grid of thickness."""
+        if self.exposures is not None:
+            return self.exposures.response(model, self.range_um[0], TABLE_STEP_UM, self._count)
+        light = model.system.flat_fields(self.geometry.wavelength_nm, LINE_STEP_NM)
+        return self._grid_response(model, light, slice(None))
 
     def _keep(self, key: _Key, table: FloatArray) -> None:
         self._tables[key] = table
@@ -255,10 +280,10 @@ class Forward:
     def _response(self, settings: Settings) -> FloatArray:
         """Response of all exposures; those whose wavelength stays are not computed again."""
         model = self._model(settings)
-        light = model.system.flat_fields(self.geometry.wavelength_nm, LINE_STEP_NM)
         moving = {key for key in settings if self.effect_of(key).search.moves_wavelengths}
-        if not moving and settings:
-            return self._grid_response(model, light, slice(None))
+        if self.exposures is not None or (settings and not moving):
+            return self._fresh(model)
+        light = model.system.flat_fields(self.geometry.wavelength_nm, LINE_STEP_NM)
         rest = tuple(sorted((key, value) for key, value in settings.items() if key not in moving))
         keys = [(rest, row, float(first)) for row, first in enumerate(light.wavelength_nm[:, 0])]
         fresh = [row for row, key in enumerate(keys) if key not in self._rows]

@@ -99,6 +99,18 @@ class Point:
         """Whitened data minus model."""
         return self.problem.data.value * self.root - self.response
 
+    @cached_property
+    def first_residual(self) -> FloatArray:
+        """The same at a thickness that was known before the data; where none was, that of the point."""
+        if not self.problem.known:
+            return self.residual
+        return self.residual + self.steep * (self.thickness_um - self.problem.thickness_um)
+
+    def beside_thickness(self, values: FloatArray) -> FloatArray:
+        """Whitened values ``(W, N)`` times the inverse covariance of noise and errors of the thickness."""
+        precision = (self.steep**2).sum(axis=0) + self.problem.thickness_sigma_um**-2.0
+        return np.asarray(values - self.steep * ((self.steep * values).sum(axis=0) / precision))
+
     def whitened(self, values: FloatArray) -> FloatArray:
         """Model values in units of the noise."""
         return np.asarray(values * self.levels[:, np.newaxis] * self.root)
@@ -303,7 +315,7 @@ class Point:
     def misfit(self, free: int) -> float:
         """Rms of the residual over that of noise, with so many dense parameters fitted."""
         seen = self.problem.data.seen
-        left = float((self.projected(self.residual)[:, seen] ** 2).sum())
+        left = float((self.projected(self.first_residual)[:, seen] ** 2).sum())
         return float(np.sqrt(left / max(float(self.noise_share[:, seen].sum()) - free, 1.0)))
 
     @cached_property

@@ -85,7 +85,7 @@ def state_of(point: Point, columns: Columns, known: FloatArray | float = 0.0) ->
     shape = (len(point.levels), *point.problem.forward.geometry.sample_shape)
     base = point.information(columns, columns) + known
     step = np.linalg.solve(base, point.score(columns))
-    left = point.projected(point.residual - np.tensordot(step, columns.value, axes=1))
+    left = point.projected(point.first_residual - np.tensordot(step, columns.value, axes=1))
     left = left / np.sqrt(np.maximum(point.noise_share, 0.05))
     root = point.root.reshape(shape)
     flat = Whitener(root, np.zeros(shape), np.zeros(shape[1:]))

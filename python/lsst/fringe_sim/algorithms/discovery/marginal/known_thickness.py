@@ -8,9 +8,8 @@ import numpy as np
 
 from ....array_types import FloatArray
 from ...inference import Point, Problem
-from ..cells import CellData
+from ..cells import UNSTATED_UM, CellData
 
-UNSTATED_UM = 0.01  # Error of a map that states none [µm], as in the present search
 LEAST_UM = 1e-4  # Error of the best map [µm], as in the present search
 
 SHARES = np.geomspace(1e-2, 1.0, 41)

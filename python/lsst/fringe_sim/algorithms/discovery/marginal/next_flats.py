@@ -7,7 +7,7 @@ the thickness that suits it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from ....array_types import FloatArray
 from ....errors import InputError
 from ....model import FringeModel
-from ...inference import Data, Forward, Hypothesis, Point
+from ...inference import Data, Forward, Hypothesis, Point, Problem
 from ...next_measurement import (
     FlatMeasurement,
     FlatSeries,
+    Measurement,
     PairForecast,
     RankedMeasurement,
     candidate_measurements,
@@ -32,7 +33,7 @@ MARGIN_UM = 0.1  # Thickness beyond that of the cells which tables of further fl
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class Seen:
     """What some flats show of every cell that stands for the sensor."""
 
     value: FloatArray  # (W, N)
@@ -57,12 +58,7 @@ class FlatForecast:
         here = self._seen(self.best.point.problem.forward, None, name, rivals)
         present = self._information([here])
         found = []
-        for measurement in self._candidates():
-            try:
-                further = self._seen(self._forward(measurement.series), measurement.series, name, rivals)
-            except InputError:  # what the effects cannot be under these conditions
-                continue
-            after = self._information([here, further])
+        for measurement, after in self._further(name, rivals, here):
             pairs, first = [], 1
             for other, rival in rivals.items():
                 own = slice(first, first + 1 + len(rival.items))
@@ -72,6 +68,17 @@ class FlatForecast:
             pairs.sort(key=lambda pair: pair.separation_after)
             found.append(RankedMeasurement(measurement, tuple(pairs)))
         return tuple(sorted(found, key=lambda item: -item.separation))
+
+    def _further(
+        self, name: str, rivals: Mapping[str, Hypothesis], here: Seen
+    ) -> Iterator[tuple[Measurement, FloatArray]]:
+        """What could be measured, and the information of all data then; ``here``: what those show that are there."""
+        for measurement in self._candidates():
+            try:
+                further = self._seen(self._forward(measurement.series), measurement.series, name, rivals)
+            except InputError:  # what the effects cannot be under these conditions
+                continue
+            yield measurement, self._information([here, further])
 
     def _candidates(self) -> tuple[FlatMeasurement, ...]:
         geometry = self.cells.geometry
@@ -108,7 +115,7 @@ class FlatForecast:
 
     def _seen(
         self, forward: Forward, series: FlatSeries | None, name: str, rivals: Mapping[str, Hypothesis]
-    ) -> _Seen:
+    ) -> Seen:
         """What flats show; ``series``: conditions of further ones, none for those that are there."""
         order, own = self._order, self.best.point
         value, slope = forward.predict(self._under(series, own.settings), own.thickness_um)
@@ -125,10 +132,13 @@ class FlatForecast:
                 asked.append((forward.predict(moved, there)[0] - other) / step)
         if series is None:
             weight = own.problem.data.weight[:, order] * own.levels[:, np.newaxis] ** 2
+            weight = np.resize(
+                weight, (len(value), len(order))
+            )  # further frames have the noise of those there
         else:
             weight = np.full((len(value), len(order)), series.level_e * self.cells.cell_px**2)
         weight = weight * (own.problem.data.seen.sum() / len(order))
-        return _Seen(value[:, order], slope[:, order], weight, np.stack(asked)[:, :, order])
+        return Seen(value[:, order], slope[:, order], weight, np.stack(asked)[:, :, order])
 
     def _under(self, series: FlatSeries | None, settings: Mapping[str, float]) -> Mapping[str, float]:
         """Settings under other conditions: those whose null a set-up states keep their ratio to it."""
@@ -142,15 +152,18 @@ class FlatForecast:
             for key, value in item.values.items()
         }
 
-    def _information(self, seen: list[_Seen]) -> FloatArray:
-        """Products of what is asked with one another, all that is free projected out."""
+    def _information(self, seen: list[Seen], problem: Problem | None = None) -> FloatArray:
+        """Products of what is asked with one another, all that is free projected out.
+
+        ``problem``: what is known of the cells beforehand; that of the search by default.
+        """
         value, slope, weight = (
             np.concatenate([getattr(one, name) for one in seen]) for name in ("value", "slope", "weight")
         )
         asked = np.concatenate([one.asked for one in seen], axis=1)
         at = self.best.point.thickness_um[self._order]
         data = Data(value, weight)
-        problem = self.best.point.problem
+        problem = problem or self.best.point.problem
         # Each stands for several, which are known better together.
         several = problem.data.seen.sum() / len(at)
         sigma = np.broadcast_to(problem.thickness_sigma_um, problem.thickness_um.shape)[self._order]

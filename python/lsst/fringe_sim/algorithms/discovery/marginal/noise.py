@@ -15,22 +15,21 @@ def measured_noise(point: Point, shape: tuple[int, int, int]) -> tuple[FloatArra
     """Measured over stated standard deviation of the noise ``(W,)``, and the scatter of the response of the cells.
 
     The projected residual of a cell has the variance that its projector says; second differences of neighbours remove
-    what is smooth. What exceeds that along the response, beside the thickness, is scatter of the response.
+    what is smooth. What exceeds that along the response, beside a thickness that may be off by its error, is scatter
+    of the response.
     """
     seen = np.asarray((point.problem.data.weight > 0.0).all(axis=0))
     good = _nine(seen.reshape(shape[1:])[np.newaxis])[0]
     if min(shape[1:]) < 3 or good.sum() < FEWEST:
         return np.ones(shape[0]), point.problem.response_sigma
-    left = point.projected(point.residual).reshape(shape)
+    # A thickness that is known has followed the noise by a part of its error.
+    left = point.projected(point.first_residual).reshape(shape)
     share = _mean_of_nine(point.noise_share.reshape(shape))
     factor = np.sqrt((_second(left)[:, good] ** 2).mean(axis=1) / share[:, good].mean(axis=1))
     factor = _shrunk(factor, int(good.sum()))
-    beside = point.steep * (
-        (point.steep * point.response).sum(axis=0) / (point.steep**2).sum(axis=0).clip(1e-12)
-    )
-    common = point.response - beside
-    length = np.sqrt((common**2).sum(axis=0)).clip(1e-12)
-    along = ((common * point.residual).sum(axis=0) / length).reshape(1, *shape[1:])
+    common = point.beside_thickness(point.response)
+    length = np.sqrt((common * point.response).sum(axis=0)).clip(1e-12)
+    along = ((common * point.first_residual).sum(axis=0) / length).reshape(1, *shape[1:])
     excess = (_second(along)[0, good] ** 2).mean() - float(np.mean(factor**2))
     scatter2 = excess / _mean_of_nine((length**2).reshape(1, *shape[1:]))[0, good].mean()
     return factor, float(np.sqrt(max(scatter2, 0.0)))

@@ -12,6 +12,7 @@ from ....effects import Effect
 from ....model import FringeModel
 from ....products.fringe_cube import FringeCube
 from ....products.mask import mask_bits
+from ...exposures import Exposures
 from ...inference import (
     CellShape,
     Data,
@@ -69,14 +70,16 @@ def prepare(
     most_cells: int,
     rules: Rules,
     rng: np.random.Generator,
+    exposures: Exposures | None = None,
 ) -> Prepared:
     """Split a cube, average what is searched to cells, find thickness and noise, fit the unchanged model.
 
     Cells are made larger while the thickness of one is not known well enough and fringes stay wider than a cell.
+    ``exposures``: their light, flats by default; other light is of sensors whose thickness is known.
     """
     held = _held_out(cube.shape[1:], rules.heldout_fraction, rng)
     size = finest_useful_cell(_masked(cube, held), most_cells=most_cells)
-    prepared = _in_cells(cube, held, size, model, effects, rules)
+    prepared = _in_cells(cube, held, size, model, effects, rules, exposures)
     if prepared.problem.known:
         return prepared
     turn = 2.0 * np.pi / prepared.problem.forward.order_um
@@ -144,7 +147,13 @@ def _masked(cube: FringeCube, out: BoolArray) -> FringeCube:
 
 
 def _in_cells(
-    cube: FringeCube, held: BoolArray, size: int, model: FringeModel, effects: Sequence[Effect], rules: Rules
+    cube: FringeCube,
+    held: BoolArray,
+    size: int,
+    model: FringeModel,
+    effects: Sequence[Effect],
+    rules: Rules,
+    exposures: Exposures | None = None,
 ) -> Prepared:
     """The same in cells of so many pixels."""
     cells = bin_cube(_masked(cube, held), size)
@@ -152,8 +161,11 @@ def _in_cells(
         bin_cube(_masked(cube, ~held), size) if held.any() else cells.restricted(np.zeros(cells.shape, bool))
     )
     stated = cells.thickness_um
-    first = continued(starting_thickness(model, cells) if stated is None else stated, cells.seen)
-    problem = as_known(_problem(cells, model, effects, first), cells)
+    if stated is None:
+        first = continued(starting_thickness(model, cells), cells.seen)
+    else:  # cells that are held out lie where the map has them
+        first = np.where(np.isfinite(stated), stated, continued(stated, np.isfinite(stated)))
+    problem = as_known(_problem(cells, model, effects, first, exposures), cells)
     # The first thickness does not believe in the contrast of the model; it stays until that of the data is known.
     known = replace(problem, thickness_sigma_um=KNOWN_UM)
     start = known.at({}, np.ones(cells.shape[0]), problem.thickness_um)
@@ -297,7 +309,11 @@ def _data(cells: CellData) -> Data:
 
 
 def _problem(
-    cells: CellData, model: FringeModel, effects: Sequence[Effect], thickness_um: FloatArray
+    cells: CellData,
+    model: FringeModel,
+    effects: Sequence[Effect],
+    thickness_um: FloatArray,
+    exposures: Exposures | None,
 ) -> Problem:
     """Problem about a first thickness ``(ny, nx)``."""
     error = FIRST_ERROR_UM if cells.thickness_um is None else float(np.median(stated_sigma_um(cells)))
@@ -306,7 +322,11 @@ def _problem(
     centroid = None
     if cells.centroid is not None:
         centroid = cells.cell_px * cells.centroid.reshape(2, cells.shape[0], -1)
-    forward = Forward(model, effects, cells.geometry, shape, limits, centroid)
+    weight = None if exposures is None else exposures.place_weight(cells.geometry)
+    weight = None if weight is None or len(weight) == 1 else weight.reshape(len(weight), -1)
+    forward = Forward(
+        model, effects, cells.geometry, shape, limits, centroid, exposures=exposures, place_weight=weight
+    )
     return Problem(_data(cells), forward, thickness_um.ravel(), FIRST_SCATTER)
 
 

@@ -29,20 +29,20 @@ def size_of(prepared: Prepared) -> dict[str, float]:
 def _noise_and_misfit(prepared: Prepared) -> list[tuple[float, float, float]]:
     """Variance of a value by noise, χ² and degrees of freedom: of single exposures, and of what all of them share.
 
-    The thickness of every cell is taken out of both.
+    The thickness of every cell is taken out of both, as far as it may be off.
     """
     point, cells = prepared.null.point, prepared.cells
     seen = point.problem.data.seen
-    response, steep, residual = (own[:, seen] for own in (point.response, point.steep, point.residual))
-    square = np.maximum((steep**2).sum(axis=0), 1e-300)
-    response, residual = (own - steep * ((steep * own).sum(axis=0) / square) for own in (response, residual))
-    length2 = (response**2).sum(axis=0)
-    along2 = (response * residual).sum(axis=0) ** 2 / length2
+    left = point.beside_thickness(point.first_residual)[:, seen]
+    response, residual = point.response[:, seen], point.first_residual[:, seen]
+    length2 = (response * point.beside_thickness(point.response)[:, seen]).sum(axis=0)
+    along2 = (response * left).sum(axis=0) ** 2 / length2
     scatter2 = cells.response_scatter**2
     shared = float((along2 / (1.0 + length2 * scatter2)).sum())
-    single = float((residual**2).sum() - along2.sum())
+    single = float((residual * left).sum() - along2.sum())
     of_shared = float((1.0 / length2).mean())
-    freedom = float(np.count_nonzero(point.root) - 2 * response.shape[1] - len(point.levels))
+    free = 1 if point.problem.known else 2  # of a cell: the response, and a thickness that is not known
+    freedom = float(np.count_nonzero(point.root) - free * response.shape[1] - len(point.levels))
     return [
         (cells.noise_rms**2 - scatter2 - of_shared, single, max(freedom, 1.0)),
         (of_shared + scatter2, shared, float(response.shape[1])),

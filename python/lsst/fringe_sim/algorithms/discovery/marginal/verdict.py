@@ -12,6 +12,7 @@ import numpy as np
 from ....effects import Effect
 from ....model import FringeModel
 from ....products.fringe_cube import FringeCube
+from ...exposures import Exposures
 from ...inference import Hypothesis
 from ...next_measurement import RankedMeasurement
 from ..channels import Channel
@@ -31,6 +32,7 @@ from .heldout import Unseen, judge_unseen, rms_unseen
 from .lesson import CellLesson, CellPart, with_corrections
 from .naming import Naming, name_effects
 from .next_flats import FlatForecast
+from .next_frames import FrameForecast
 from .preparation import prepare, prepare_again
 from .rules import Rules
 from .search import SetSearch
@@ -39,9 +41,10 @@ from .telling import data_of, rms_left, size_of, steps_of
 
 
 class MarginalSearch:
-    """One search of flats by one log marginal likelihood, and how its answer is put.
+    """One search of exposures by one log marginal likelihood, and how its answer is put.
 
-    Parameters are those of `discover`; thickness and noise are fitted with the unchanged model when it is made.
+    Parameters are those of `search_exposures`; thickness and noise are fitted with the unchanged model when it is
+    made.
     """
 
     def __init__(
@@ -52,14 +55,17 @@ class MarginalSearch:
         rng: np.random.Generator,
         options: SearchOptions,
         report: Callable[[str], None],
+        exposures: Exposures | None = None,
     ) -> None:
         shared = {field.name for field in fields(Rules)} & {field.name for field in fields(SearchOptions)}
         # Both searches share what they call by one name, but for the cost of a round.
         rules = Rules(**{name: getattr(options, name) for name in shared - {"refits"}})
         report("fitting the thickness with the unchanged model")
-        prepared = prepare(cube, model, effects, options.most_cells, rules, rng)
+        prepared = prepare(cube, model, effects, options.most_cells, rules, rng, exposures)
         self.prepared, self.model, self.rules, self.report = prepared, model, rules, report
         self.options, self.rng, self.until = options, rng, math.inf
+        # On the sky the errors of the tables are those of the map too.
+        self.teaches = exposures is None
         stack = model.system.stack
         medium = stack.layers[stack.position(model.system.varying)].medium
         wavelength = prepared.cells.wavelength_nm
@@ -211,8 +217,9 @@ class MarginalSearch:
     def _what_would_decide(
         self, best: Hypothesis, naming: Naming
     ) -> tuple[tuple[NamedEffect, ...], tuple[dict[str, Any], ...]]:
-        """Named effects with the flats that would decide between the members of their class."""
-        forecast = FlatForecast(best, self.model, self.prepared.cells)
+        """Named effects with the data that would decide between the members of their class."""
+        made = FlatForecast if best.point.problem.forward.exposures is None else FrameForecast
+        forecast = made(best, self.model, self.prepared.cells)
 
         def rank(effect: NamedEffect, rivals: Values) -> tuple[RankedMeasurement, ...]:
             known: Mapping[str, Hypothesis] = naming.classes[effect.name].rivals
@@ -227,7 +234,7 @@ class MarginalSearch:
         """The effects of a set that are not the cause, and which no correction can replace."""
 
         def evidence(one: Hypothesis) -> float:
-            return self.sets.posterior(one) + best_evidence(self._part(one))
+            return self.sets.posterior(one) + (best_evidence(self._part(one)) if self.teaches else 0.0)
 
         def smaller(one: Hypothesis) -> list[Hypothesis]:
             leave = [name for name in one.effects if self.catalogue.may_leave((name,), one.effects)]
@@ -244,6 +251,8 @@ class MarginalSearch:
 
     def _learned(self, found: Hypothesis) -> dict[str, Any]:
         """A correction beside a set, judged by cells that it has not seen; nothing where there is none."""
+        if not self.teaches:
+            return {}
         self.report("learning a correction from what is left")
         least = self.rules.sure + self.catalogue.price  # what an effect must bring
         try:
@@ -256,7 +265,7 @@ class MarginalSearch:
     def _accuracy(self, found: Hypothesis) -> dict[str, Any]:
         """The disagreement beside what the model may be wrong by."""
         assumed = self.options.model_accuracy
-        if assumed == 0.0:
+        if not self.teaches or assumed == 0.0:
             return {}
         try:
             with time_limit(self.until):
