@@ -58,9 +58,6 @@ def flats_of(rng: np.random.Generator, effects: dict[str, float]) -> FringeCube:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True, reason="a charge diffusion beside both voids, with probability 0.88: unexplained"
-)
 def test_two_voids_are_named() -> None:
     hidden = {"void": (130.0, 20.3, 17.6, 8.2), "void_2": (60.0, 45.0, 44.0, 10.0)}
     settings = {key: value for name, own in hidden.items() for key, value in void(name, *own).items()}

@@ -244,9 +244,11 @@ def test_cells_under_the_rim_of_an_island_are_those_of_pixels(
         each(share.reshape(24, 24), reach).ravel() for each in (maximum_filter, minimum_filter)
     )
     rim = (most_of > 0.0) & (least_of < 1.0)
-    level = (value * mixed)[:, ~rim].sum(axis=1) / (mixed**2)[:, ~rim].sum(axis=1)
+    # A blur errs at edges.
+    away = ~rim & np.pad(np.ones((18, 18), dtype=bool), 3, constant_values=not blur_px).ravel()
+    level = (value * mixed)[:, away].sum(axis=1) / (mixed**2)[:, away].sum(axis=1)
     wrong = (value / level[:, np.newaxis] - mixed) / mixed.std(axis=1, keepdims=True)
-    assert wrong[:, ~rim].std() < (4e-3 if blur_px else 5e-4)
+    assert wrong[:, away].std() < (4e-3 if blur_px else 5e-4)
     assert wrong[:, rim].std() < most
 
 

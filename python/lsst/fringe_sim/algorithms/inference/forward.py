@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.polynomial.hermite_e import hermegauss
@@ -21,6 +22,7 @@ from .cell_average import CellShape, look_up
 
 Settings = Mapping[str, float]
 _Key = tuple[tuple[str, float], ...]
+_Nodes = tuple[FloatArray, FloatArray]
 
 TABLE_STEP_UM = 0.004
 """Spacing of the thickness grid [µm]: 75 per fringe order; cubic interpolation is good to 1e-6."""
@@ -34,6 +36,10 @@ NUDGE_UM = 1e-3
 """Change of thickness with which effects on the image are differentiated [µm]; they are nearly linear."""
 
 RIM_PLACES = 3  # Places along an axis that stand for a blur where it crosses the rim of an island
+
+PHASE_STEP_NM = 0.5  # Spacing of wavelength nodes where the mean phase of a line is all that is asked [nm]
+
+MOST_PARTS = 4  # Sets of islands whose places are kept for reuse
 
 MOST_TABLES = 400  # Tables kept for reuse; which of them are there changes no answer
 
@@ -57,6 +63,9 @@ class Forward:
     _rows: dict[tuple[_Key, int, float], FloatArray] = field(default_factory=dict, repr=False)
     _by_name: dict[str, Effect] = field(default_factory=dict, repr=False)
     _phases: dict[_Key, float] = field(default_factory=dict, repr=False)
+    _parts: dict[tuple[Any, ...], tuple[list[FloatArray], list[_Nodes]]] = field(
+        default_factory=dict, repr=False
+    )
 
     def __post_init__(self) -> None:
         self._by_name.update({effect.name: effect for effect in self.catalogue})
@@ -110,10 +119,9 @@ class Forward:
         """The same before effects on the image."""
         everywhere = {key: value for key, value in optical.items() if not self.effect_of(key).local}
         islands = self._model(optical).islands if len(everywhere) < len(optical) else ()
-        covered = [self._covered(item, blur_px) for item, _ in islands]
-        outside, *on = self._nodes_of_parts(covered, blur_px)
+        parts, (outside, *on) = self._parts_of(tuple(item for item, _ in islands), blur_px)
         value, slope = self._looked_up(self.table(everywhere), thickness_um, outside)
-        for (item, model), (part, _), nodes in zip(islands, covered, on, strict=True):
+        for (item, model), part, nodes in zip(islands, parts, on, strict=True):
             own = {f"{item.effect.name}.{name}": x for name, x in item.values.items()}
             places = {f"{item.effect.name}.{name}" for name in item.effect.search.places}
             key = tuple(sorted({**everywhere, **{k: v for k, v in own.items() if k not in places}}.items()))
@@ -122,6 +130,19 @@ class Forward:
                 all_ + part * (here - all_) for all_, here in zip((value, slope), inside, strict=True)
             )
         return value, slope
+
+    def _parts_of(
+        self, islands: tuple[ActiveEffect, ...], blur_px: float
+    ) -> tuple[list[FloatArray], list[_Nodes]]:
+        """Parts of the cells on islands, and places in thickness outside all and of each; the latest are kept."""
+        values = [(item.effect.name, *sorted(item.values.items())) for item in islands]
+        key = self.shape, blur_px, *values
+        if key not in self._parts:
+            if len(self._parts) >= MOST_PARTS:
+                self._parts.clear()
+            covered = [self._covered(item, blur_px) for item in islands]
+            self._parts[key] = [part for part, _ in covered], self._nodes_of_parts(covered, blur_px)
+        return self._parts[key]
 
     def _covered(self, item: ActiveEffect, blur_px: float) -> tuple[FloatArray, FloatArray]:
         """Part of every cell on an island, ``(N,)``, and its moments, ``(5, N)``: means over the reach of a blur."""
@@ -142,7 +163,7 @@ class Forward:
 
     def _nodes_of_parts(
         self, covered: Sequence[tuple[FloatArray, FloatArray]], blur_px: float
-    ) -> list[tuple[FloatArray, FloatArray]]:
+    ) -> list[_Nodes]:
         """Places in thickness outside all islands, and of each."""
         if not covered:
             return [self.shape.nodes(blur_px)]
@@ -189,7 +210,7 @@ class Forward:
             if len(self._phases) > MOST_TABLES:
                 self._phases.clear()
             system = self._model(everywhere).system
-            light = system.flat_fields(self.geometry.wavelength_nm, LINE_STEP_NM)
+            light = system.flat_fields(self.geometry.wavelength_nm, PHASE_STEP_NM)
             phase = system.reduce(light).kappa[0].real  # of every state but harmonics that were added
             self._phases[key] = float(np.log(np.average(phase, axis=1, weights=light.weight)).mean())
         return self._phases[key]

@@ -83,8 +83,12 @@ def effect_columns(point: Point, items: Sequence[Coordinate], secant: float = SE
         values[row] = point.whitened((value - point.value) / step)
         slopes[row] = point.whitened((slope - point.slope) / step)
         if follows:
+            up, down = (
+                forward.predict(point.settings, point.thickness_um + sign * moved_um)[1]
+                for sign in (1.0, -1.0)
+            )
             values[row] -= point.steep * moved_um / step
-            slopes[row] -= point.curved * moved_um / step
+            slopes[row] -= point.whitened((up - down) / (2.0 * step))
         phases[row] = phase / step
     return point.columns(values, slopes, phases)
 
@@ -178,7 +182,7 @@ def in_best_orders(point: Point, where: BoolArray | None = None, rounds: int = 4
     moves = np.ones(len(point.thickness_um)) if where is None else where.astype(float)
     best, energy = point.thickness_um.copy(), point.cell_energy.copy()
     for shift in SHIFTS:
-        own = point.moved(point.levels, point.thickness_um + shift * order_um * moves)
+        own = point.moved(point.levels, point.thickness_um + shift * order_um * moves) if shift else point
         for number in range(rounds + 1):
             better = own.cell_energy < energy
             best[better], energy[better] = own.thickness_um[better], own.cell_energy[better]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -104,6 +105,7 @@ def best_gain(matrix: FloatArray, gradient: FloatArray, scale: FloatArray) -> tu
     return best, step
 
 
+@lru_cache(maxsize=2)
 def residuals_of(point: Point) -> Residuals:
     """What a point leaves of the data, and of the thickness beside a smooth one."""
     geometry = point.problem.forward.geometry
