@@ -68,7 +68,9 @@ class Result:
     """How a map compares with the truth: shares of pixels, σ in nm, width of the pulls of right orders.
 
     ``own`` is the width of the pulls about their mean, without the uncertainty that all pixels share; ``common`` is
-    that mean over this uncertainty, one number for a sensor. ``margin`` is the chi-square by which the next order is
+    the mean error over its uncertainty, one number for a sensor: that of the scale, which all pixels share, and the
+    scatter of the means of 4 by 4 parts of the map over their number, as errors of neighbours are not independent.
+    ``margin`` is the chi-square by which the next order is
     said to be worse, and ``right`` whether the order of the sensor is right, masked or not. ``foretold`` is the share
     of unmasked pixels that their uncertainty alone puts off by more than half an order.
     """
@@ -153,6 +155,7 @@ def judge(fitted: ThicknessMap, truth: np.ndarray, seconds: float = 0.0) -> Resu
     pull = (error / sigma)[right]
     shared = float(fitted.metadata.get("SCALESIG", 0.0)) * fitted.value[good].astype(float)
     mean = float(error[right].mean()) if right.any() else float("nan")
+    uneven = scatter_of_mean(np.where(good, fitted.value - truth, np.nan))
     own = ((error - mean) / np.sqrt(np.maximum(sigma**2 - shared**2, 1e-12)))[right]
     return Result(
         float(1.0 - right.mean()) if right.size else 0.0,
@@ -163,11 +166,19 @@ def judge(fitted: ThicknessMap, truth: np.ndarray, seconds: float = 0.0) -> Resu
         seconds,
         float(fitted.metadata.get("MISFIT", 0.0)),
         float(np.sqrt(np.mean(own**2))) if own.size else float("nan"),
-        mean / float(shared.mean()) if own.size and shared.any() else 0.0,
+        float(mean / np.hypot(shared.mean(), uneven)) if own.size and shared.any() else 0.0,
         float(fitted.metadata.get("ORDMARG", np.inf)),
         abs(float(np.nanmedian(fitted.value - truth))) < 0.5 * ORDER_UM,
         float(np.mean(erfc(0.5 * ORDER_UM / (np.sqrt(2.0) * sigma)))) if good.any() else 0.0,
     )
+
+
+def scatter_of_mean(error: np.ndarray) -> float:
+    """Uncertainty of the mean error of right orders, from its scatter over 4 by 4 parts of a map."""
+    right = np.where(np.abs(error) < 0.5 * ORDER_UM, error, np.nan)
+    parts = [part for strip in np.array_split(right, 4) for part in np.array_split(strip, 4, axis=1)]
+    means = [float(np.nanmean(part)) for part in parts if np.isfinite(part).any()]
+    return float(np.std(means, ddof=1) / np.sqrt(len(means))) if len(means) > 1 else 0.0
 
 
 def draw_map(rng: np.random.Generator, size: int) -> np.ndarray:

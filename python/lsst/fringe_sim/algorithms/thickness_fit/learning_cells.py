@@ -14,7 +14,7 @@ from .cells import Cells, effective_number
 from .nuisances import Nuisances, light_patterns, patterns_of_cells
 from .pixels import CellSurface
 
-_MOST_CELLS = 3_000
+MOST_CELLS = 3_000
 _MOST_BLOCKS = 6_000
 _LARGEST_BLOCK = 6
 _LEAST_KEPT = 0.7  # Share of its contrast that a block must keep
@@ -39,7 +39,7 @@ class LearningCells:
         cls, cells: Cells, thickness_um: NDArray[np.float32], free: Nuisances, temper: float, order_um: float
     ) -> LearningCells:
         """Some thousand cells with a thickness, drawn at random but always the same."""
-        good = some_of(np.flatnonzero(np.isfinite(thickness_um)), _MOST_CELLS)
+        good = some_of(np.flatnonzero(np.isfinite(thickness_um)), MOST_CELLS)
         pattern, zones = patterns_of_cells(cells, free, *np.unravel_index(good, cells.shape))
         width = cells.value.shape[-1]
         return cls(

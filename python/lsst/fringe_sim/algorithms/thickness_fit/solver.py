@@ -16,7 +16,8 @@ from .common_order import rank_orders
 from .evidence import OrderEvidence, order_evidence, refine_cells
 from .first_nuisances import first_nuisances
 from .learning import learn
-from .learning_cells import LearningCells, sample_blocks, some_of
+from .learning_cells import MOST_CELLS, LearningCells, sample_blocks, some_of
+from .local_surface import local_surface
 from .mean_response import SENSOR_ORDERS, normalise_to_cells, normalise_to_pixels, spans_orders
 from .misfit import judge_cells
 from .narrow_sensor import NarrowSensor, is_own_mean, settle_narrow_sensor
@@ -96,14 +97,15 @@ class Solver:
             described, narrow = self._described(cells, templates)
             if described is not None:
                 return described
-        # Fringes of few orders look like light that each wavelength has of its own: both are tried.
+        # Fringes of few orders look like light that each wavelength has of its own, or like levels of zones.
         starts = [
             first_nuisances(cells, templates, self.free, own)
             for own in ((True,) if narrow is None else (True, False))
         ]
         solved = (state for start in starts for state in self._solve_from(start, cells, templates))
         alone = (self._learn(state, ranked=True) for state in (narrow,) if state is not None)
-        return self._likeliest(chain(solved, alone))
+        level = self._solve_with_one_level(cells, templates) if narrow is not None else iter(())
+        return self._likeliest(map(self._on_surfaces, chain(solved, alone, level)))
 
     def _likeliest(self, states: Iterator[State]) -> State:
         """The most probable of some solutions; the best with another relief is its rival."""
@@ -138,6 +140,36 @@ class Solver:
             if _agree(before, state):
                 break
             fitted, nuisance, alike = state.templates, state.nuisance, state.alike
+
+    def _solve_with_one_level(self, cells: Cells, templates: FlatTemplates) -> Iterator[State]:
+        """A solution that begins without levels of zones, which take fringes that hardly turn within a zone."""
+        zones = patterns_of_cells(cells, self.free, *np.zeros((2, 1), np.intp))[1]
+        if zones == 0:
+            return
+        one = replace(self, free=replace(self.free, zones="sensor"))
+        start = first_nuisances(cells, templates, one.free)
+        state = min(one._solve_from(start, cells, templates), key=lambda state: state.nuisance.cost())
+        even = np.insert(state.nuisance.coefficients, [1] * zones, 0.0, axis=1)
+        state = replace(state, free=self.free, nuisance=replace(state.nuisance, coefficients=even))
+        yield self._learn(state, ranked=True)
+
+    def _on_surfaces(self, state: State) -> State:
+        """The solution with cells on the surface that their neighbours show, while that is more probable.
+
+        A cell of weak fringes stays where noise put it, and all that is learned follows. Only a sensor all of whose
+        cells are learned from is asked: of others each cell has little say.
+        """
+        if not 0 < np.count_nonzero(np.isfinite(state.thickness_um)) <= MOST_CELLS:
+            return state
+        for _ in range(_MOST_SOLUTIONS):
+            surface = surface_of(state, self.order_um)
+            local = local_surface(surface, state.cells, state.templates, surface.known, self.order_um)
+            thickness = np.where(surface.known, local.terms[..., 0], np.float32(np.nan))
+            moved = self._learn(replace(state, thickness_um=thickness), ranked=False)
+            if not moved.nuisance.cost() < state.nuisance.cost():
+                break
+            state = moved
+        return state
 
     def _described(self, cells: Cells, templates: FlatTemplates) -> tuple[State | None, State | None]:
         """Solution with the model as it is, if that describes the flats, and in any case that of a narrow sensor.
@@ -310,7 +342,7 @@ class Solver:
         if state.described:  # what is free is learned from the pixels
             return state
         if state.free.any:
-            return self._learn(state, ranked=True)
+            return self._on_surfaces(self._learn(state, ranked=True))
         if state.normalisation == "range":
             return state
         if state.normalisation == "narrow":  # refitting and renormalising in turn would crawl
