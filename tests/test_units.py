@@ -13,7 +13,7 @@ from astropy import units as u
 
 from lsst.fringe_sim.algorithms import simulate_sky_frame
 from lsst.fringe_sim.algorithms.sky_frame import sky_response
-from lsst.fringe_sim.errors import InputError
+from lsst.fringe_sim.errors import InputError, named_units
 from lsst.fringe_sim.instrument.sky import SkySpectrum
 from lsst.fringe_sim.instrument.telescope import telescope_beam
 from lsst.fringe_sim.model import FringeModel
@@ -149,3 +149,13 @@ def test_a_sky_frame_from_quantities() -> None:
     response = sky_response(model, SkySpectrum.dark(), thickness_range_um=(13_800 * u.nm, 0.0142 * u.mm))
     found = simulate_sky_frame(1e-6 * thickness * u.m, model, response=response, exposure_s=0.5 * u.min)
     np.testing.assert_allclose(found.image, plain.image, rtol=1e-6)
+
+
+def test_what_counts_per_length_is_no_length() -> None:
+    @named_units
+    def three(per_um: Any, slope_per_nm: Any, gap_um: Any) -> tuple[Any, ...]:
+        return per_um, slope_per_nm, gap_um
+
+    assert three(2.0 / u.um, 3.0 / u.nm, 1500.0 * u.nm) == (2.0 / u.um, 3.0 / u.nm, 1.5)
+    with pytest.raises(InputError, match="gap_um"):
+        three(2.0, 3.0, 1.0 / u.um)
