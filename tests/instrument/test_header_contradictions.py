@@ -221,6 +221,13 @@ def test_the_place_of_a_rebuilt_raft_is_said() -> None:
     assert "RTM-020_S01" in note
 
 
+def test_a_raft_other_than_that_of_the_sensor_is_said_where_the_header_names_the_raft() -> None:
+    (note,) = interpret(TS8_HEADER, SLOTNAME="S01", RAFTNAME="LCA-11021_RTM-004").notes
+    assert "RTM-004_S01" in note
+    assert "RTM-020_S01" in note
+    assert interpret(TS8_HEADER, SLOTNAME="S01", RAFTNAME="R11").notes == ()  # a bay, which is no raft module
+
+
 def test_what_is_taken_for_granted_is_said() -> None:
     assert interpret(TS8_HEADER).notes == ()
     assert interpret(LSSTCAM_HEADER).notes == ()
