@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from dataclasses import replace
 
 import numpy as np
@@ -109,3 +110,21 @@ def test_dim_flats_are_averaged_until_the_thickness_of_a_cell_is_known(recorded:
         "cost": [prepared.free.cost, prepared.point.cost], "noise": prepared.noise_factor,
         "levels": prepared.point.levels,
     })  # fmt: skip
+
+
+@pytest.mark.rng("memory of a search")
+@pytest.mark.parametrize("core", ["present", "marginal"])
+def test_nothing_of_a_search_stays_in_memory(core: str, rng: np.random.Generator) -> None:
+    def models() -> set[int]:
+        gc.collect()
+        rooms = ("lsst.fringe_sim.algorithms.inference.", "lsst.fringe_sim.algorithms.discovery.")
+        return {
+            id(item)
+            for item in gc.get_objects()
+            if str(getattr(type(item), "__module__", "")).startswith(rooms)
+            and type(item).__name__ in ("Forward", "Problem")
+        }
+
+    before = models()
+    assert verdict_of(cube_of(rng, {}), core).verdict == "no_discrepancy"
+    assert models() <= before

@@ -4,7 +4,7 @@ from .cell_average import CellShape
 from .common_offset import led, with_common_offset
 from .coordinates import Coordinate, coordinates_of
 from .forward import Forward
-from .marginal import Columns, Data, Point, Problem, joined
+from .marginal import Columns, Data, Point, Problem, joined, kept
 from .optimise import (
     Hypothesis,
     effect_columns,
@@ -32,6 +32,7 @@ __all__ = [
     "in_whole_orders",
     "joined",
     "jumped",
+    "kept",
     "led",
     "relaxed",
     "with_common_offset",

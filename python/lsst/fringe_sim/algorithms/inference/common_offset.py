@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 
 from ...array_types import FloatArray
-from .marginal import Point
+from .marginal import Point, kept
 
 OFFSETS = np.arange(-18, 19) / 12.0
 """Moves of the thickness that are tried [orders]: as far as the present search lets it follow an effect."""
 
 
-@lru_cache(maxsize=8)
+@kept(8)
 def led(point: Point) -> Point:
     """The same problem with the thickness about which the data are linear; where it is not known, the point itself.
 

@@ -63,6 +63,8 @@ class Forward:
     exposures: Exposures | None = None  # the light, monochromator flats by default
     # weights of the places of the field whose light is known, for every cell, ``(K, N)``; one place by default
     place_weight: FloatArray | None = None
+    # answers about points that are kept as long as the model, by the name of the function
+    kept: dict[str, dict[Any, Any]] = field(default_factory=dict, repr=False)
     _tables: dict[_Key, FloatArray] = field(default_factory=dict, repr=False)
     _rows: dict[tuple[_Key, int, float], FloatArray] = field(default_factory=dict, repr=False)
     _by_name: dict[str, Effect] = field(default_factory=dict, repr=False)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, wraps
+from typing import TypeVar
 
 import numpy as np
 
@@ -55,6 +56,28 @@ class Problem:
     def about(self, thickness_um: FloatArray) -> Problem:
         """The same about another first thickness ``(N,)``; one that is known stays."""
         return self if self.known else replace(self, thickness_um=thickness_um)
+
+
+About = TypeVar("About", "Problem", "Point")
+Answer = TypeVar("Answer")
+
+
+def kept(most: int) -> Callable[[Callable[[About], Answer]], Callable[[About], Answer]]:
+    """Keep the latest answers of a function about points or problems, and none longer than their forward model."""
+
+    def keeping(function: Callable[[About], Answer]) -> Callable[[About], Answer]:
+        @wraps(function)
+        def answered(about: About) -> Answer:
+            problem = about if isinstance(about, Problem) else about.problem
+            answers: dict[About, Answer] = problem.forward.kept.setdefault(function.__qualname__, {})
+            answers[about] = answers.pop(about) if about in answers else function(about)
+            while len(answers) > most:
+                answers.pop(next(iter(answers)))
+            return answers[about]
+
+        return answered
+
+    return keeping
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
 from ....array_types import BoolArray, FloatArray
 from ....effects import Effect, Residuals
 from ....errors import OutOfRangeError
-from ...inference import Columns, Coordinate, Hypothesis, Point, effect_columns, in_best_orders, jumped
+from ...inference import Columns, Coordinate, Hypothesis, Point, effect_columns, in_best_orders, jumped, kept
 from ...inference.coordinates import SECANT
 from .pairs import FEW, Joint, Promised
 from .smooth import beside_smooth
@@ -105,7 +104,7 @@ def best_gain(matrix: FloatArray, gradient: FloatArray, scale: FloatArray) -> tu
     return best, step
 
 
-@lru_cache(maxsize=2)
+@kept(2)
 def residuals_of(point: Point) -> Residuals:
     """What a point leaves of the data, and of the thickness beside a smooth one."""
     geometry = point.problem.forward.geometry

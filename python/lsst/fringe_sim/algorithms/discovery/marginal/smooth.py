@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 from scipy import sparse
@@ -12,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from scipy.sparse.linalg import splu
 
 from ....array_types import FloatArray
-from ...inference import Point, Problem
+from ...inference import Point, Problem, kept
 from ..continuation import curvature_of
 
 STIFFEST = 12.0
@@ -64,7 +63,7 @@ def _weight(point: Point, thickness_um: FloatArray) -> FloatArray:
     return np.asarray(weight / weight.max())
 
 
-@lru_cache(maxsize=2)
+@kept(2)
 def _stiffness(problem: Problem) -> float:
     """The likeliest stiffness of the first thickness of a problem, in units of the information of a cell."""
     point = problem.at({}, np.ones(len(problem.data.value)), problem.thickness_um)
