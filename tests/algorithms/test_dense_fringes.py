@@ -8,6 +8,7 @@ import pytest
 from lsst.fringe_sim.algorithms.thickness_fit import remarks
 from lsst.fringe_sim.algorithms.thickness_fit.conclusion import slope_cards
 from lsst.fringe_sim.cli.main import run
+from lsst.fringe_sim.instrument.measured_thickness import e2v_321
 from lsst.fringe_sim.products import FlatFit, ThicknessMap
 
 ORDER_UM = 0.3
@@ -53,5 +54,8 @@ def test_a_small_sensor_of_the_mock_is_told_why(tmp_path: Path, capsys: pytest.C
     words = capsys.readouterr().out
     assert "too dense" in words
     assert "discover" not in words
-    stated = ThicknessMap.read_fits(out / "thickness.fits").metadata
-    assert float(stated["SLOPECON"]) == pytest.approx(float(stated["CONTRAST"]), abs=0.15)
+    # A part of the map is in wrong orders, and what is learned with it has too little contrast.
+    fitted, true = ThicknessMap.read_fits(out / "thickness.fits"), e2v_321((64, 64)).astype(np.float32)
+    left = slope_cards(true, float(fitted.metadata["ORDERUM"]))["SLOPECON"]
+    assert float(fitted.metadata["SLOPECON"]) == pytest.approx(left, abs=0.03)
+    assert float(fitted.metadata["CONTRAST"]) < left + 0.03
