@@ -319,6 +319,10 @@ class Point:
         left = self.residual_cells - np.tensordot(step, columns.cells, axes=1)
         return np.asarray(self._back_solved(left)[1])
 
+    def following_um(self, values: FloatArray) -> FloatArray:
+        """Change of the thickness with which whitened values ``(W, N)``, added to the model, add the least [µm]."""
+        return np.asarray(-self._back_solved(self._forward_solved(self._along(values)))[1])
+
     @property
     def wanted_um(self) -> FloatArray:
         """Change of the thickness of every cell to its best, all else as it is [µm]."""

@@ -66,7 +66,8 @@ def effect_columns(point: Point, items: Sequence[Coordinate], secant: float = SE
     """Derivatives with respect to parameters of effects; ``secant``: see `Coordinate.difference`.
 
     A difference is taken along the thickness of equal phase, and what that adds is put back: otherwise half of the
-    step times the square of a phase of hundreds of radians per unit would look like a loss of contrast.
+    step times the square of a phase of hundreds of radians per unit would look like a loss of contrast. Along a longer
+    secant the thickness follows what an effect does to light, since the fringes of a layer shift by a radian and more.
     """
     shape = (len(items), *point.value.shape)
     values, slopes, phases = np.empty(shape), np.empty(shape), np.empty(len(items))
@@ -78,7 +79,9 @@ def effect_columns(point: Point, items: Sequence[Coordinate], secant: float = SE
         settings = {**point.settings, item.key: now + step}
         phase = forward.log_phase(settings) - before
         follows = bool(phase) and not item.step and secant == SECANT
-        moved_um = point.thickness_um * math.expm1(-phase) if follows else 0.0
+        moved_um: FloatArray | float = point.thickness_um * math.expm1(-phase) if follows else 0.0
+        if secant > SECANT and forward.effect_of(item.key).acts_on != "image":
+            follows, moved_um = True, _following_um(point, settings)
         value, slope = forward.predict(settings, point.thickness_um + moved_um)
         values[row] = point.whitened((value - point.value) / step)
         slopes[row] = point.whitened((slope - point.slope) / step)
@@ -91,6 +94,16 @@ def effect_columns(point: Point, items: Sequence[Coordinate], secant: float = SE
             slopes[row] -= point.whitened((up - down) / (2.0 * step))
         phases[row] = phase / step
     return point.columns(values, slopes, phases)
+
+
+def _following_um(point: Point, settings: dict[str, float], rounds: int = 2) -> FloatArray:
+    """Move of the thickness of every cell with which other settings differ least from a point [µm]."""
+    moved = np.zeros_like(point.thickness_um)
+    for _ in range(rounds):
+        value, _ = point.problem.forward.predict(settings, point.thickness_um + moved)
+        step = point.following_um(point.whitened(value - point.value))
+        moved = moved + np.clip(step, -MOST_JUMP_UM, MOST_JUMP_UM)
+    return moved
 
 
 def relaxed(point: Point, rounds: int = 3, tolerance: float = 0.02) -> Point:
