@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lsst.fringe_sim.blocks import means_of_known
+from lsst.fringe_sim.blocks import block_means, block_sums, in_blocks, means_of_known
 from lsst.fringe_sim.style import (
     BAD_GREY,
     color_bar,
@@ -164,3 +164,20 @@ def test_pieces_of_a_figure_are_those_of_the_whole() -> None:
         made.subplots()
         whole, pieces = to_pieces(made)
         assert [(title, part.shape) for title, part in pieces] == [("", whole.shape)]
+
+
+@pytest.mark.parametrize("diverging", [False, True])
+def test_limits_of_a_map_have_the_first_and_the_last_colour(diverging: bool) -> None:
+    """Exactly: the colours of the bar end where the limits are."""
+    shown = picture(map_to_png(np.array([[-1.0, 3.0]]), (-1.0, 3.0), diverging=diverging))[0]
+    colors = matplotlib.colormaps["PuOr_r" if diverging else "cividis"]
+    np.testing.assert_array_equal(shown, np.rint(255.0 * colors(np.array([0.0, 1.0]))[:, :3]))
+
+
+def test_blocks_of_a_stack_are_those_of_its_images() -> None:
+    stack = np.arange(2 * 3 * 5 * 7, dtype=float).reshape(2, 3, 5, 7)
+    for images in (stack[0, 0], stack[0], stack):
+        assert in_blocks(images, 2).shape == (*images.shape[:-2], 2, 2, 3, 2)
+        # The mean of a block of steps of 1 along columns and 7 along rows lies 4 above its first pixel.
+        np.testing.assert_allclose(block_means(images, 2), images[..., :4:2, :6:2] + 4.0)
+        np.testing.assert_allclose(block_sums(images, 2), 4.0 * images[..., :4:2, :6:2] + 16.0)

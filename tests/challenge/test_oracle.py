@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
+from lsst.fringe_sim.algorithms.discovery.fit import Fit
+from lsst.fringe_sim.challenge import oracle
 from lsst.fringe_sim.challenge.oracle import visibility
 from lsst.fringe_sim.challenge.sealed_cases import CASE_KINDS, SealedCase, draw_case, expose
 from lsst.fringe_sim.mock.thickness import random_field
+from lsst.fringe_sim.products import FringeCube
 
 
 def sealed(seed: int = 3, **values: float) -> SealedCase:
@@ -60,3 +63,25 @@ def test_what_another_valley_of_the_other_explains_is_not_seen() -> None:
     case = draw_case("two", streams[0])
     assert set(case.names) == {"support_index", "air_gap"}
     assert visibility(case).each["air_gap"] < 5.0
+
+
+@pytest.mark.parametrize(("valley", "wanted"), [(-8, 3.0), (-1, 3.0), (1, 3.0), (9, 10.0)])
+def test_every_valley_of_the_other_effect_is_tried(
+    valley: int, wanted: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Eight on either side of its true index. Without the insulation χ² is 100, and 9 in one of the valleys."""
+    truth = {"insulation.offset": 0.02, "support_index.offset": -0.06}
+    flat = FringeCube.from_arrays(np.full((2, 4, 4), 2e4), np.array([920.0, 960.0]))
+    names = ("insulation", "support_index")
+    case = SealedCase(flat, "ts8_e2v", "two", names, truth, np.full((4, 4), 15.0), 1.0)
+
+    def fit_there(problem, coordinates, start, field, levels, absent) -> Fit:
+        chi2 = {0: 400.0, 2: 0.0}.get(len(coordinates), 100.0)
+        if [item.key for item in coordinates] == ["support_index.offset"]:
+            (item,) = coordinates
+            at = item.coordinate(truth[item.key]) + valley * item.neighbour
+            chi2 = 9.0 if abs(start[0] - at) < 0.1 * item.neighbour else 100.0
+        return Fit({}, tuple(coordinates), start, np.zeros(0), field, chi2, np.eye(len(coordinates)))
+
+    monkeypatch.setattr(oracle, "fit_model", fit_there)
+    assert visibility(case, most_cells=16).each["insulation"] == pytest.approx(wanted)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from product_makers import cube
 from recorded_numbers import Record
 
 from lsst.fringe_sim.algorithms.discovery import Verdict
@@ -16,7 +17,7 @@ from lsst.fringe_sim.challenge.demo_case import SECOND_EFFECTS, draw_demo_case, 
 from lsst.fringe_sim.challenge.oracle import Oracle, Visibility, visibility
 from lsst.fringe_sim.challenge.page import write_challenge_report
 from lsst.fringe_sim.challenge.result import CaseResult, ChallengeResult
-from lsst.fringe_sim.challenge.sealed_cases import OUTSIDERS, SIZES, draw_case, expose
+from lsst.fringe_sim.challenge.sealed_cases import OUTSIDERS, SIZES, SealedCase, draw_case, expose
 from lsst.fringe_sim.errors import UnknownNameError
 
 
@@ -238,3 +239,10 @@ def test_names_in_any_order() -> None:
     for names in itertools.permutations("xby"):
         assert run.is_right(names, verdict_of(found, 1.0, 1.0))
     assert not run.is_right("xbb", verdict_of(found, 1.0, 1.0))
+
+
+def test_the_fall_of_the_variance_beside_that_of_the_oracle() -> None:
+    """Squares of what is left: 25 to 16 of the 25 to 9 that could be reached."""
+    case = SealedCase(cube(), "ts8_e2v", "none", (), {}, np.full((3, 4), 14.0), 1.0)
+    reached = Oracle(Visibility(9.0, {}), verdict_of((), 5.0, 3.0))
+    assert run.judge(case, verdict_of((), 5.0, 4.0), 0, 1.0, reached).shrinkage == pytest.approx(9.0 / 16.0)

@@ -257,3 +257,10 @@ detectors:
     path.write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(InputError, match=message):
         Camera.from_file(path)
+
+
+def test_amplifiers_are_counted_from_one_in_the_order_of_their_file() -> None:
+    (sensor,) = Camera.from_name("hsc").detectors
+    assert [(amp.name, amp.channel) for amp in sensor.amplifiers] == [
+        ("A1", 1), ("A2", 2), ("A3", 3), ("A4", 4),
+    ]  # fmt: skip

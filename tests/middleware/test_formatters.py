@@ -20,7 +20,7 @@ import lsst.fringe_sim.products as products
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.camera import Camera
 from lsst.fringe_sim.instrument.raw_frame import RawFrame, read_raw_metadata
-from lsst.fringe_sim.middleware import register_storage_classes
+from lsst.fringe_sim.middleware import formatters, register_storage_classes
 from lsst.fringe_sim.middleware.afw import frame_from_exposure
 from lsst.fringe_sim.middleware.raw_ingest import ingest_raws
 
@@ -296,3 +296,18 @@ def test_images_of_a_whole_sensor_have_world_coordinates(butler: Butler) -> None
     assert centre == pytest.approx((sensor.x_mm, sensor.y_mm))
     small = put(butler, MAKERS["FringeFlat"](), "small", "FringeFlat")
     assert "WCSNAMEF" not in fits.getheader(butler.getURI(small).ospath, "IMAGE")
+
+
+def test_rows_and_columns_say_whether_an_image_is_of_the_whole_sensor(
+    butler: Butler, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where it is one of several planes; of a sensor so small that it is soon written."""
+    small = Camera.from_name("lsstCam").detector(37).cut_down((32, 64))
+    monkeypatch.setattr(formatters, "sensor_of", lambda data_id: small)
+    for product, columns, known in (
+        ("FringeFlat", 64, True),
+        ("FringeCube", 64, True),
+        ("FringeCube", 63, False),
+    ):
+        ref = put(butler, MAKERS[product]((32, columns)), f"{product}{columns}", product)
+        assert ("WCSNAMEF" in fits.getheader(butler.getURI(ref).ospath, "IMAGE")) is known

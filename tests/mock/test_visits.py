@@ -11,7 +11,7 @@ from lsst.fringe_sim.algorithms import simulate_sky_frame
 from lsst.fringe_sim.cli.main import run
 from lsst.fringe_sim.errors import InputError
 from lsst.fringe_sim.instrument.camera import Camera
-from lsst.fringe_sim.mock import random_field
+from lsst.fringe_sim.mock import random_field, visits
 from lsst.fringe_sim.mock.visit_sources import Scene, VisitConditions, VisitImage
 from lsst.fringe_sim.mock.visits import detected_sky, write_mock_visits
 from lsst.fringe_sim.model import FringeModel, Setup
@@ -187,3 +187,16 @@ def test_a_table_that_is_no_silicon_is_refused_before_work(tmp_path, capsys) -> 
     arguments = ["--size", "64x64", "--seed", "1", "--silicon", "nosuch", "--dry-run"]
     assert run(["mock-visits", str(tmp_path / "night"), *arguments]) == 1
     assert "nosuch" in capsys.readouterr().err
+
+
+@pytest.mark.rng("visits: their hours")
+def test_visits_begin_at_even_steps_of_the_night(rng, tmp_path, monkeypatch) -> None:
+    """The first at one o'clock, the others a quarter of six hours later each."""
+    dark = visits.DetectedSky(("continuum",), 0, np.full((1, *SHAPE), 50.0, dtype=np.float32))
+    monkeypatch.setattr(visits, "detected_sky", lambda *_: dark)
+    night = VisitConditions(4, hours=6.0)
+    made = write_mock_visits(
+        tmp_path, setup="lsst_e2v", detector=94, thickness_um=np.full(SHAPE, 15.0), rng=rng, conditions=night
+    )
+    begun = [fits.getheader(visit.path, "IMAGE")["DATE-OBS"] for visit in made]
+    assert begun == [f"2026-01-15T{time}:00.000" for time in ("01:00", "02:30", "04:00", "05:30")]

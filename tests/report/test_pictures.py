@@ -2,19 +2,24 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from astropy.table import Table
+from matplotlib.figure import Figure
+from product_makers import templates
 from small_pages import verdict
 
 from lsst.fringe_sim.algorithms.discovery.verdict import MOST_CANDIDATES
 from lsst.fringe_sim.errors import InputError
-from lsst.fringe_sim.report.correction_page import frame_figure
+from lsst.fringe_sim.products.fringe_templates import PER_SKY
+from lsst.fringe_sim.report.correction_page import frame_figure, write_templates_report
 from lsst.fringe_sim.report.discovery_figures import candidates_figure, where_figure
 from lsst.fringe_sim.report.discovery_page import discovery_page
 from lsst.fringe_sim.report.focal_plane_page import focal_plane_figure
+from lsst.fringe_sim.report.page import Report
 from lsst.fringe_sim.style import figure, panels, show_image, to_png
 
 
@@ -119,3 +124,20 @@ def test_what_a_color_bar_says_stays_in_its_panel() -> None:
         for part in made.subfigs:
             (beside,) = part.axes[0].child_axes
             assert beside.yaxis.label.get_window_extent().x1 <= part.bbox.x1 + 2.0  # pixels
+
+
+@pytest.mark.parametrize(
+    ("per_sky", "factor", "unit"), [(True, 100.0, "% of the sky"), (False, 1.0, "unit of the frames")]
+)
+def test_templates_are_drawn_in_their_unit(
+    per_sky: bool, factor: float, unit: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Parts of the sky in per cent, and counts as they are."""
+    product = templates((6, 8), mask=np.zeros((6, 8), np.int32), metadata={PER_SKY: per_sky})
+    made: list[Figure] = []
+    monkeypatch.setattr(Report, "figure", lambda self, one, caption: made.append(one))
+    write_templates_report(tmp_path / "page.html", [("S1", product)])
+    shown = [axes for axes in made[0].axes if axes.images and axes.get_title().startswith("template")]
+    for axes, pattern in zip(shown, product.patterns, strict=True):
+        np.testing.assert_allclose(axes.images[0].get_array(), factor * pattern, rtol=1e-6)
+        assert axes.child_axes[0].get_ylabel() == f"template [{unit}]"
