@@ -235,3 +235,8 @@ def test_what_is_refused(angular):
     tilted = FringeModel.from_setup("lsst_e2v", {"tilt.angle": 2.0})
     with pytest.raises(InputError, match="none that changes the beam"):
         angular_response(tilted, bright_sky(4), beam_limits(beams), thickness_range_um=RANGE)
+    for limits in ((0.0, 1.0), (0.1, 0.1), (-0.01, 0.1)):
+        with pytest.raises(OutOfRangeError, match="limits of sin² of the angle"):
+            angular_response(
+                FringeModel.from_setup("lsst_e2v"), bright_sky(4), limits, thickness_range_um=RANGE
+            )

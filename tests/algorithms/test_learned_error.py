@@ -11,8 +11,9 @@ from lsst.fringe_sim.algorithms.thickness_fit.evidence import refine_row
 from lsst.fringe_sim.algorithms.thickness_fit.learned_error import learned_sigma
 from lsst.fringe_sim.algorithms.thickness_fit.learning import moves_of
 from lsst.fringe_sim.algorithms.thickness_fit.learning_cells import LearningCells
+from lsst.fringe_sim.algorithms.thickness_fit.local_surface import shares_of_middle
 from lsst.fringe_sim.algorithms.thickness_fit.nuisances import NuisanceFit
-from lsst.fringe_sim.algorithms.thickness_fit.pixels import CellSurface
+from lsst.fringe_sim.algorithms.thickness_fit.pixels import SAME_SURFACE, CellSurface
 
 ORDER_UM, STEP_UM = 0.3, 0.001
 WAVELENGTHS = np.array([900.0, 930.0, 960.0])
@@ -85,3 +86,26 @@ def test_nothing_learned_is_no_error(templates) -> None:
     for fit in (NuisanceFit.none(3), learned(templates, 0.1)):
         found = learned_sigma(cells, surface, np.zeros((16, 16), bool), templates, FREE, fit, ORDER_UM)
         assert not found.any()
+
+
+@pytest.mark.parametrize("size", [1, 2, 8])
+def test_the_share_of_a_cell_is_that_of_a_fit_by_least_squares(size: int) -> None:
+    """Slopes of an order from cell to cell, and bends of what breaks a surface, also of single pixels."""
+    noise = 0.5 * ORDER_UM * np.linspace(0.5, 1.5, 25).reshape(5, 5)
+    flat, every, at = np.zeros((5, 5), np.float32), np.ones((5, 5), bool), size * np.arange(5.0)
+    surface = CellSurface(flat, flat, flat, at, at, every, every, noise.astype(np.float32))
+    middle = np.array([2])
+    b, a, share = shares_of_middle(surface, noise**-2.0, middle, middle, ORDER_UM)
+    up, over = b[0] - 2.0, a[0] - 2.0
+    terms = np.stack([np.ones(25), up, over, up**2, up * over, over**2], axis=1) / noise[b[0], a[0], None]
+    prior = np.diag(1.0 / (ORDER_UM * np.array([1.0, 1.0, 1.0, *[SAME_SURFACE] * 3])))
+    # A unit of each cell, everything else nothing: what the fit makes of it in the middle.
+    data = np.vstack([np.diag(1.0 / noise[b[0], a[0]]), np.zeros((6, 25))])
+    expected = np.linalg.lstsq(np.vstack([terms, prior]), data)[0][0]
+    np.testing.assert_allclose(share[0], expected, atol=1e-9)
+
+
+def test_the_grid_of_templates_ends_at_its_last_thickness(templates) -> None:
+    """4000 steps from 13 µm."""
+    assert templates.stop_um == pytest.approx(13.0 + 3999 * STEP_UM, abs=1e-9)
+    assert templates.thickness_um[-1] == pytest.approx(templates.stop_um, abs=1e-9)

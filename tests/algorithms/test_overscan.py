@@ -23,11 +23,12 @@ def amplifier(
     serial: int = 20,
     parallel: int = 12,
     noise: float = 4.0,
+    drift: float = 0.5,
 ) -> RawAmplifier:
     """A level that drifts along a line, noise, light of 500 ADU, and columns that differ from each other."""
     rng = np.random.default_rng(7)
     height, width = rows + parallel, prescan + columns + serial
-    data = 1000.0 + 0.5 * np.arange(height)[:, np.newaxis] + noise * rng.standard_normal((height, width))
+    data = 1000.0 + drift * np.arange(height)[:, np.newaxis] + noise * rng.standard_normal((height, width))
     imaging = slice(0, rows), slice(prescan, prescan + columns)
     data[:, imaging[1]] += 3.0 * rng.standard_normal(columns)
     data[imaging] += 500.0
@@ -69,6 +70,15 @@ def test_a_row_with_charge_gets_the_median_of_the_rows_around_where_nothing_is_r
         around = np.concatenate([plain[row - NEARBY_ROWS : row], plain[row + 1 : row + NEARBY_ROWS + 1]])
         assert spoilt[row] == pytest.approx(np.median(np.append(around, np.inf)), abs=1e-6)
     assert spoilt[row] == pytest.approx(1000.0 + 0.5 * row, abs=3.0)
+
+
+@pytest.mark.parametrize("drift", [-2.0, 2.0])
+@pytest.mark.parametrize("row", [2, 117])
+def test_a_row_with_charge_near_an_end_lies_on_a_drift_that_rises_or_falls(row: int, drift: float) -> None:
+    """Without a prescan the level is a median of the rows around, two of which charge or the last five may move."""
+    amp = amplifier(prescan=0, noise=1.0, drift=drift)
+    spoilt = level_of(charged(amp, slice(row, row + 1), 400))
+    assert spoilt[row] == pytest.approx(1000.0 + drift * row, abs=3.0 * abs(drift))
 
 
 def test_a_row_with_charge_lies_between_its_neighbours_and_one_that_was_moved_keeps_its_level() -> None:

@@ -102,3 +102,14 @@ def test_a_perfect_model_leaves_no_rings() -> None:
 def test_too_few_pixels_show_nothing() -> None:
     residual, weight = noise_and_weight((12, 20), 0.01, np.random.default_rng(1))
     assert TreeRings().propose(Residuals(residual, weight, geometry_of((12, 20)))) == ()
+
+
+@pytest.mark.parametrize(("rows", "longest"), [(401, 280.0), (101, 70.0), (31, 50.5), (2001, 500.0)])
+def test_the_longest_period_is_a_part_of_the_sensor(rows: int, longest: float) -> None:
+    """0.7 of the longer side between middles of pixels, within the 500 px of the catalogue, and beyond the null."""
+    middle = {size: np.arange(float(size)) for size in (rows, 21)}
+    effect, beside = TreeRings(), geometry_of((rows, 21))
+    period = next(item for item in effect.parameters if item.name == "period")
+    assert effect.bounds_on(period, beside) == pytest.approx((2.0, longest))
+    turned = ImageGeometry((21, rows), middle[21], middle[rows], WAVELENGTHS, beside.level_e)
+    assert effect.bounds_on(period, turned) == pytest.approx((2.0, longest))
