@@ -66,8 +66,8 @@ def effect_columns(point: Point, items: Sequence[Coordinate], secant: float = SE
     """Derivatives with respect to parameters of effects; ``secant``: see `Coordinate.difference`.
 
     A difference is taken along the thickness of equal phase, and what that adds is put back: otherwise half of the
-    step times the square of a phase of hundreds of radians per unit would look like a loss of contrast. Along a longer
-    secant the thickness follows what an effect does to light, since the fringes of a layer shift by a radian and more.
+    step times the square of a phase of hundreds of radians per unit would look like a loss of contrast. Along a
+    longer secant the thickness follows what an effect does to light, since fringes shift by a radian and more.
     """
     shape = (len(items), *point.value.shape)
     values, slopes, phases = np.empty(shape), np.empty(shape), np.empty(len(items))
