@@ -14,13 +14,11 @@ import numpy as np
 from ....array_types import FloatArray
 from ....model import FringeModel
 from ...exposures import Exposures
-from ...inference import Forward, Hypothesis
+from ...inference import Forward, Hypothesis, Problem
 from ...measurement_forecast import RESPONSE_SCATTER
 from ...next_measurement import FlatSeries, Measurement
 from ..next_frames import laboratory_flats
 from .next_flats import FlatForecast, Seen
-
-FREE_UM = 10.0  # Error of a thickness that is not known [µm]: many orders
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +36,7 @@ class FrameForecast(FlatForecast):
         alone = replace(
             problem,
             known=False,
-            thickness_sigma_um=FREE_UM,
+            thickness_sigma_um=Problem.thickness_sigma_um,
             response_sigma=RESPONSE_SCATTER / self.cells.cell_px,
         )
         present = self._information([here])
