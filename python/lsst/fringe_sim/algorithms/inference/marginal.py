@@ -252,7 +252,7 @@ class Point:
         return np.asarray(0.5 * (both + along[..., 0, :] / uu))
 
     @cached_property
-    def _curved(self) -> FloatArray:
+    def curved(self) -> FloatArray:
         """Whitened second derivative with respect to thickness."""
         up, down = (
             self.problem.forward.predict(self.settings, self.thickness_um + sign * SECOND_STEP_UM)[1]
@@ -262,7 +262,7 @@ class Point:
 
     @cached_property
     def _log_det_by_thickness(self) -> FloatArray:
-        along, second = self._along(self.steep), self._curved
+        along, second = self._along(self.steep), self.curved
         return self._log_det_by(
             along, (self.response * second).sum(axis=0), (self.steep * second).sum(axis=0)
         )
@@ -289,7 +289,7 @@ class Point:
     @cached_property
     def unbiased_residual(self) -> FloatArray:
         """The whitened residual without what a thickness that follows noise leaves on the average."""
-        return self.residual + 0.5 * self.projected(self._curved * self.thickness_sigma_um**2)
+        return self.residual + 0.5 * self.projected(self.curved * self.thickness_sigma_um**2)
 
     def followed_um(self, step: FloatArray, columns: Columns) -> FloatArray:
         """Change of the thickness that goes with a step of dense parameters [µm]."""

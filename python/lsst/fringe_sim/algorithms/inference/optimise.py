@@ -83,12 +83,8 @@ def effect_columns(point: Point, items: Sequence[Coordinate], secant: float = SE
         values[row] = point.whitened((value - point.value) / step)
         slopes[row] = point.whitened((slope - point.slope) / step)
         if follows:
-            up, down = (
-                forward.predict(point.settings, point.thickness_um + sign * moved_um)[1]
-                for sign in (1.0, -1.0)
-            )
             values[row] -= point.steep * moved_um / step
-            slopes[row] -= point.whitened((up - down) / (2.0 * step))
+            slopes[row] -= point.curved * moved_um / step
         phases[row] = phase / step
     return point.columns(values, slopes, phases)
 
