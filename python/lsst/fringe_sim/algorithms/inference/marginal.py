@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -59,13 +59,49 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Whitened derivatives with respect to K dense parameters, and what they do to the log determinant of a cost."""
+    """Whitened derivatives with respect to K dense parameters, and what they do to the log determinant of a cost.
 
-    value: FloatArray  # (K, W, N)
+    The first L may be of one exposure alone each, in the order of the exposures.
+    """
+
+    value: FloatArray  # (K - L, W, N): of all exposures
     cells: (
         FloatArray  # (K, 2, N): their part along response and thickness of the cells, in units of unit noise
     )
     log_det: FloatArray  # (K,): derivative of the log determinant of the cells, the thickness following
+    alone: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # (L, N): of one exposure
+
+    def __len__(self) -> int:
+        """Number of parameters."""
+        return len(self.log_det)
+
+    def along(self, values: FloatArray) -> FloatArray:
+        """Products with whitened values ``(..., W, N)``, shape ``(K, ...)``."""
+        one = values.reshape(-1, *values.shape[-2:])
+        found = np.empty((len(self), len(one)))
+        levels = len(self.alone)
+        if levels:
+            found[:levels] = np.einsum("ln,kln->lk", self.alone, one[:, :levels])
+        found[levels:] = np.tensordot(self.value, one, axes=([1, 2], [1, 2]))
+        return found.reshape(len(self), *values.shape[:-2])
+
+    def products(self, other: Columns) -> FloatArray:
+        """Products with other columns, ``(K, K')``."""
+        if not len(self.alone):
+            return other.along(self.value).T
+        first = np.zeros((len(self.alone), len(other.alone)))
+        if len(other.alone):
+            np.fill_diagonal(first, np.einsum("ln,ln->l", self.alone, other.alone))
+        levels = np.einsum("ln,kln->lk", self.alone, other.value[:, : len(self.alone)])
+        return np.concatenate([np.concatenate([first, levels], axis=1), other.along(self.value).T])
+
+    def combined(self, step: FloatArray) -> FloatArray:
+        """What a step of the parameters does, ``(W, N)``."""
+        levels = len(self.alone)
+        total = np.tensordot(step[levels:], self.value, axes=1)
+        if levels:
+            total[:levels] += step[:levels, np.newaxis] * self.alone
+        return np.asarray(total)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,16 +261,12 @@ class Point:
     @cached_property
     def level_columns(self) -> Columns:
         """Those of the levels."""
-        waves = len(self.levels)
         value, slope = self.value * self.root, self.slope * self.root
-        values = np.zeros((waves, *self.value.shape))
-        values[np.arange(waves), np.arange(waves)] = value
         # Each is of one exposure alone.
         along = np.stack([self.response * value, self.steep * value], axis=-2)
         cells = self._forward_solved(along)
-        return Columns(
-            values, cells, self._log_det_change(along, self.response * slope, self.steep * slope, cells)
-        )
+        change = self._log_det_change(along, self.response * slope, self.steep * slope, cells)
+        return Columns(np.zeros((0, *self.value.shape)), cells, change, value)
 
     def _log_det_change(
         self, along: FloatArray, us: FloatArray, ts: FloatArray, cells: FloatArray
@@ -269,12 +301,12 @@ class Point:
 
     def information(self, first: Columns, second: Columns) -> FloatArray:
         """Fisher matrix of dense columns with the cells integrated."""
-        whole = np.tensordot(first.value, second.value, axes=([1, 2], [1, 2]))
+        whole = first.products(second)
         return np.asarray(whole - np.tensordot(first.cells, second.cells, axes=([1, 2], [1, 2])))
 
     def score(self, columns: Columns) -> FloatArray:
         """Derivative of the log likelihood with respect to dense parameters, without that of the determinant."""
-        whole = np.tensordot(columns.value, self.residual, axes=([1, 2], [0, 1]))
+        whole = columns.along(self.residual)
         return np.asarray(whole - np.tensordot(columns.cells, self.residual_cells, axes=([1, 2], [0, 1])))
 
     def unbiased_score(self, columns: Columns) -> FloatArray:
@@ -283,7 +315,7 @@ class Point:
         A cell that follows its noise leaves a mean residual of second order, half of the variance of its thickness
         times the second derivative; a score that falls on many cells would take that for an effect.
         """
-        whole = np.tensordot(columns.value, self.unbiased_residual, axes=([1, 2], [0, 1]))
+        whole = columns.along(self.unbiased_residual)
         return np.asarray(whole - np.tensordot(columns.cells, self.residual_cells, axes=([1, 2], [0, 1])))
 
     @cached_property
@@ -335,9 +367,10 @@ class Point:
 
 
 def joined(first: Columns, second: Columns) -> Columns:
-    """Columns of two groups of parameters."""
+    """Columns of two groups of parameters; those of single exposures are in the first."""
     return Columns(
         np.concatenate([first.value, second.value]),
         np.concatenate([first.cells, second.cells]),
         np.concatenate([first.log_det, second.log_det]),
+        first.alone,
     )

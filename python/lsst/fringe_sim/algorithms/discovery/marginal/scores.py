@@ -86,8 +86,7 @@ class Scorer:
                 degrees = int(few.sum())
         if len(items) == 1 and items[0].side * step[0] < 0.0:
             best, step = -1.0, -step
-        signature = np.tensordot(step, own.value, axes=1)
-        signature -= np.tensordot(across @ step, self.columns.value, axes=1)
+        signature = own.combined(step) - self.columns.combined(across @ step)
         flat = self.point.projected(signature).ravel()
         fall = max(2.0 * float(gradient @ step) - float(step @ matrix @ step), 0.0)
         unit = flat / max(float(np.linalg.norm(flat)), 1e-300)
