@@ -25,6 +25,7 @@ from .cell_average import CellShape, look_up
 Settings = Mapping[str, float]
 _Key = tuple[tuple[str, float], ...]
 _Nodes = tuple[FloatArray, FloatArray]
+Light = tuple[FloatArray, FloatArray]
 _Kept = TypeVar("_Kept")
 
 TABLE_STEP_UM = 0.004
@@ -42,7 +43,7 @@ RIM_PLACES = 3  # Places along an axis that stand for a blur where it crosses th
 
 PHASE_STEP_NM = 0.5  # Spacing of wavelength nodes where the mean phase of a line is all that is asked [nm]
 
-MOST_PARTS = 4  # Sets of islands whose places are kept for reuse
+MOST_PARTS = 4  # Sets of islands, and of effects on the image, that are kept for reuse
 
 MOST_TABLES = 400  # Tables kept for reuse; which of them are there changes no answer
 
@@ -69,6 +70,8 @@ class Forward:
     _levels: dict[_Key, FloatArray] = field(default_factory=dict, repr=False)
     _rows: dict[tuple[_Key, int, float], tuple[FloatArray, float]] = field(default_factory=dict, repr=False)
     _by_name: dict[str, Effect] = field(default_factory=dict, repr=False)
+    _of_key: dict[str, Effect] = field(default_factory=dict, repr=False)
+    _images: dict[_Key, tuple[tuple[ActiveEffect, ...], float]] = field(default_factory=dict, repr=False)
     _phases: dict[_Key, float] = field(default_factory=dict, repr=False)
     _parts: dict[tuple[Any, ...], tuple[list[FloatArray], list[_Nodes]]] = field(
         default_factory=dict, repr=False
@@ -96,37 +99,61 @@ class Forward:
 
     def effect_of(self, key: str) -> Effect:
         """The effect that a setting belongs to."""
-        name = key.partition(".")[0]
-        if name not in self._by_name:
-            self._by_name[name] = another(name, self._by_name)
-        return self._by_name[name]
+        if key not in self._of_key:
+            name = key.partition(".")[0]
+            if name not in self._by_name:
+                self._by_name[name] = another(name, self._by_name)
+            self._of_key[key] = self._by_name[name]
+        return self._of_key[key]
 
     def predict(self, settings: Settings, thickness_um: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Signal of the cells relative to its mean level, and its derivative with respect to thickness [1/µm].
 
         ``thickness_um`` (N,): thickness in the middle of the cells. Returns two arrays ``(W, N)``.
         """
-        note_evaluation()
+        return self.imaged(settings, self.light(settings, thickness_um))
+
+    def light(self, settings: Settings, thickness_um: FloatArray) -> Light:
+        """The same before effects on the image, but for their blur."""
         everything = {**self.model.effect_settings, **settings}
-        image = {key: value for key, value in everything.items() if self.effect_of(key).acts_on == "image"}
-        optical = {key: value for key, value in everything.items() if key not in image}
-        value, slope = self._light(optical, thickness_um, self._blur_px(image))
-        value, slope = 1.0 + self.contrast * (value - 1.0), self.contrast * slope
+        optical = {key: value for key, value in everything.items() if self.effect_of(key).acts_on != "image"}
+        value, slope = self._light(optical, thickness_um, self._image_of(everything)[1])
+        return 1.0 + self.contrast * (value - 1.0), self.contrast * slope
+
+    def imaged(self, settings: Settings, light: Light) -> Light:
+        """What effects on the image make of the light of some settings."""
+        note_evaluation()
+        active, _ = self._image_of({**self.model.effect_settings, **settings})
+        if not active:
+            return light
+        value, slope = light
+        changed = self._on_image(active, value)
+        return changed, (self._on_image(active, value + NUDGE_UM * slope) - changed) / NUDGE_UM
+
+    def is_of_image(self, key: str) -> bool:
+        """Whether a setting leaves the light as it is."""
+        effect = self.effect_of(key)
+        return effect.acts_on == "image" and not self._is_blur(effect)
+
+    def _image_of(self, settings: Settings) -> tuple[tuple[ActiveEffect, ...], float]:
+        """Effects on the image that do something, and the blur of all others [px]; the latest are kept."""
+        image = {key: value for key, value in settings.items() if self.effect_of(key).acts_on == "image"}
         if not image:
-            return value, slope
-        image = {key: value for key, value in image.items() if not self._is_blur(self.effect_of(key))}
-        if not any(
-            not item.is_null(self.model.base_system) for item in activate_effects(image, self.catalogue)
-        ):
-            return value, slope
-        changed = self._on_image(image, value)
-        return changed, (self._on_image(image, value + NUDGE_UM * slope) - changed) / NUDGE_UM
+            return (), 0.0
+        key = tuple(image.items())
+        if key not in self._images:
+            if len(self._images) >= MOST_PARTS:
+                self._images.clear()
+            active = activate_effects(image, self.catalogue)
+            blurs = [item.effect.blur_px(item.values) for item in active if self._is_blur(item.effect)]
+            rest = tuple(item for item in active if not self._is_blur(item.effect))
+            some = not all(item.is_null(self.model.base_system) for item in rest)
+            self._images[key] = rest if some else (), math.hypot(*blurs)
+        return self._images[key]
 
     def on_image(self, settings: Settings) -> bool:
         """Whether effects change the image, so that cells may depend on each other; blurs do not."""
-        keys = {**self.model.effect_settings, **settings}
-        effects = (self.effect_of(key) for key in keys)
-        return any(effect.acts_on == "image" and not self._is_blur(effect) for effect in effects)
+        return any(self.is_of_image(key) for key in {**self.model.effect_settings, **settings})
 
     def of_cells(self, rows: slice, columns: slice, inside: BoolArray) -> Forward:
         """The same of the cells of some rows and columns, ``inside`` (N,) is true of them."""
@@ -220,8 +247,7 @@ class Forward:
             np.einsum("kn,kwn->wn", self.place_weight, rows.reshape(-1, self.waves, rows.shape[1]))
         )
 
-    def _on_image(self, settings: Settings, value: FloatArray) -> FloatArray:
-        active = activate_effects(settings, self.catalogue)
+    def _on_image(self, active: tuple[ActiveEffect, ...], value: FloatArray) -> FloatArray:
         image = value.reshape(self.waves, *self.geometry.sample_shape)
         return apply_to_image(active, self.model.base_system, image, self.geometry).reshape(value.shape)
 
@@ -229,13 +255,6 @@ class Forward:
     def _is_blur(effect: Effect) -> bool:
         """Whether all that an effect on the image does is to spread signal alike."""
         return type(effect).blur_px is not Effect.blur_px
-
-    def _blur_px(self, image: Settings) -> float:
-        """Blur of all effects, which is a spread of the thickness where that changes evenly."""
-        active = activate_effects(image, self.catalogue) if image else ()
-        return math.hypot(
-            *(item.effect.blur_px(item.values) for item in active if self._is_blur(item.effect))
-        )
 
     def _log_phase(self, settings: Settings) -> float:
         everywhere = {

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from ...array_types import BoolArray, FloatArray
-from .forward import Forward
+from .forward import Forward, Light
 
 SECOND_STEP_UM = 1e-3  # Change of thickness with which the slope is differentiated [µm]
 
@@ -119,6 +119,11 @@ class Point:
     def root(self) -> FloatArray:
         """Inverse standard deviations."""
         return np.sqrt(self.problem.data.weight)
+
+    @cached_property
+    def light(self) -> Light:
+        """The model over level before effects on the image, and its derivative."""
+        return self.problem.forward.light(self.settings, self.thickness_um)
 
     @cached_property
     def response(self) -> FloatArray:

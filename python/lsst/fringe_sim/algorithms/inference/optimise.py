@@ -76,6 +76,11 @@ def effect_columns(point: Point, items: Sequence[Coordinate], secant: float = SE
         now = point.settings.get(item.key, item.null)
         step = item.difference(now, secant)
         settings = {**point.settings, item.key: now + step}
+        if forward.is_of_image(item.key):
+            value, slope = forward.imaged(settings, point.light)
+            values[row] = point.whitened((value - point.value) / step)
+            slopes[row], phases[row] = point.whitened((slope - point.slope) / step), 0.0
+            continue
         phase = forward.log_phase(settings) - before
         follows = bool(phase) and not item.step and secant == SECANT
         moved_um = point.thickness_um * math.expm1(-phase) if follows else 0.0
@@ -83,8 +88,12 @@ def effect_columns(point: Point, items: Sequence[Coordinate], secant: float = SE
         values[row] = point.whitened((value - point.value) / step)
         slopes[row] = point.whitened((slope - point.slope) / step)
         if follows:
+            up, down = (
+                forward.predict(point.settings, point.thickness_um + sign * moved_um)[1]
+                for sign in (1.0, -1.0)
+            )
             values[row] -= point.steep * moved_um / step
-            slopes[row] -= point.curved * moved_um / step
+            slopes[row] -= point.whitened((up - down) / (2.0 * step))
         phases[row] = phase / step
     return point.columns(values, slopes, phases)
 
