@@ -41,7 +41,9 @@ class Window:
             thickness_sigma_um=sigma if np.ndim(sigma) == 0 else np.asarray(sigma)[own],
         )
         value, slope = whole.value[:, own], whole.slope[:, own]
-        return cls(whole, Point(part, whole.settings, whole.levels, whole.thickness_um[own], value, slope), own)
+        return cls(
+            whole, Point(part, whole.settings, whole.levels, whole.thickness_um[own], value, slope), own
+        )
 
     def joined(self, part: Point) -> Point:
         """A point in which these cells and their effects are as in another one, and all other cells as they were."""
