@@ -188,11 +188,11 @@ def test_the_significance_is_that_which_was_asked_for(rng: np.random.Generator) 
 @pytest.mark.rng("another core answers")
 def test_what_the_present_search_answers_is_said(rng: np.random.Generator) -> None:
     cube = cube_of(rng, flats_of({}))
-    assert search._why_not_marginal(cube, None) == ""
+    assert search._why_not_marginal(cube) == ""
     small = replace(cube, image=cube.image[:, :12], variance=cube.variance[:, :12], mask=cube.mask[:, :12])
-    assert "16 rows" in search._why_not_marginal(small, None)
+    assert "16 rows" in search._why_not_marginal(small)
     known = np.full((SIDE, SIDE), 15.0, np.float32)
-    assert search._why_not_marginal(replace(cube, thickness=known, layer="adhesive"), None) == ""
+    assert search._why_not_marginal(replace(cube, thickness=known, layer="adhesive")) == ""
     told = verdict_of(small, "vignetting")
     assert any("the present search answers" in note for note in told.notes)
 
