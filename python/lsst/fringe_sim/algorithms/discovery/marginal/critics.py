@@ -84,7 +84,7 @@ def state_of(point: Point, columns: Columns, known: FloatArray | float = 0.0) ->
     """
     shape = (len(point.levels), *point.problem.forward.geometry.sample_shape)
     base = point.information(columns, columns) + known
-    step = np.linalg.solve(base, point.score(columns))
+    step = np.asarray(np.linalg.solve(base, point.score(columns)), dtype=float)
     left = point.projected(point.first_residual - columns.combined(step))
     left = left / np.sqrt(np.maximum(point.noise_share, 0.05))
     root = point.root.reshape(shape)

@@ -25,7 +25,7 @@ class Window:
         """The smallest rectangle about cells ``(N,)``."""
         problem, forward = whole.problem, whole.problem.forward
         rows, columns = (
-            _reach(where.reshape(forward.geometry.sample_shape).any(axis=axis)) for axis in (1, 0)
+            _reach(np.asarray(where.reshape(forward.geometry.sample_shape).any(axis=axis))) for axis in (1, 0)
         )
         inside = np.zeros(forward.geometry.sample_shape, dtype=bool)
         inside[rows, columns] = True
