@@ -13,6 +13,7 @@ from lsst.fringe_sim.algorithms.discovery.marginal.catalogue import Catalogue
 from lsst.fringe_sim.algorithms.discovery.marginal.critics import judge, spot_scores
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
 from lsst.fringe_sim.algorithms.discovery.marginal.smooth import beside_smooth
+from lsst.fringe_sim.algorithms.discovery.marginal.window import Window
 from lsst.fringe_sim.algorithms.inference import (
     CellShape,
     Data,
@@ -21,6 +22,7 @@ from lsst.fringe_sim.algorithms.inference import (
     Problem,
     coordinates_of,
     fit,
+    in_best_orders,
     relaxed,
 )
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry, Residuals
@@ -111,6 +113,32 @@ def test_thin_voids_are_proposed_there(rng: np.random.Generator) -> None:
 @pytest.mark.rng("no step of the thickness")
 def test_noise_of_the_thickness_has_no_step(rng: np.random.Generator) -> None:
     assert [find_step(residuals_of(point_of(rng, 0.0))) for _ in range(4)] == [None] * 4
+
+
+@pytest.mark.rng("cells about an island")
+def test_cells_about_an_island_say_what_all_of_them_do(rng: np.random.Generator) -> None:
+    point = point_of(rng, -0.008)
+    geometry = point.problem.forward.geometry
+    covered = np.hypot(geometry.y_px[:, np.newaxis] - 14.0, geometry.x_px - 22.0).ravel() < 8.0
+    settings = void("void", 40.0, 22.0, 14.0, 7.0)
+    whole = in_best_orders(point.moved(point.levels, point.thickness_um, settings), covered, rounds=2)
+    window = Window.about(point, covered)
+    assert 0 < window.inside.sum() < 0.3 * covered.size
+    part = window.point
+    start = part.moved(part.levels, part.thickness_um, settings)
+    own = in_best_orders(start, covered[window.inside], rounds=2)
+    assert part.cost - own.cost == pytest.approx(point.cost - whole.cost, abs=1e-6)
+    assert window.joined(own).thickness_um == pytest.approx(whole.thickness_um, abs=1e-12)
+
+
+@pytest.mark.rng("effects on the image join cells")
+def test_all_cells_are_asked_where_effects_join_them(rng: np.random.Generator) -> None:
+    point = point_of(rng, 0.0)
+    covered = np.zeros(point.thickness_um.size, dtype=bool)
+    covered[:5] = True
+    joined = point.moved(point.levels, point.thickness_um, {"crosstalk.from_left": 0.004})
+    assert Window.about(joined, covered).inside.all()
+    assert not Window.about(point, covered).inside.all()
 
 
 @pytest.mark.rng("second void beside the first")

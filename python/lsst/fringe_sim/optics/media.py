@@ -91,6 +91,15 @@ class Medium(OneLine):
         """
         wavelength = np.asarray(wavelength_nm, dtype=float)
         temperature = np.asarray(temperature_k, dtype=float)
+        if max(wavelength.size, temperature.size) > _MOST_REMEMBERED:
+            return self._computed(wavelength, temperature)
+        asked = ((x.tobytes(), x.shape) for x in (wavelength, temperature))
+        return _remembered_index(self, *asked).copy()
+
+    def _computed(
+        self, wavelength: NDArray[np.float64], temperature: NDArray[np.float64]
+    ) -> NDArray[np.complex128]:
+        """The same of arrays."""
         low, high = self.wavelength_range_nm
         check_range(f"wavelength [nm] in medium {self.name}", wavelength, low, high)
         check_range("temperature [K]", temperature, *TEMPERATURE_RANGE_K)
@@ -158,6 +167,13 @@ class _TabulatedIndex:
 
 _MOST_REMEMBERED = 4096
 """Wavelengths whose index is remembered: a fit asks for the same few hundred thousands of times."""
+
+
+@functools.lru_cache(maxsize=256)
+def _remembered_index(medium: Medium, *values: tuple[bytes, tuple[int, ...]]) -> NDArray[np.complex128]:
+    """Index of a medium for wavelengths and temperatures, not to be changed."""
+    wavelength, temperature = (np.frombuffer(text).reshape(shape) for text, shape in values)
+    return medium._computed(wavelength, temperature)
 
 
 @functools.lru_cache(maxsize=64)

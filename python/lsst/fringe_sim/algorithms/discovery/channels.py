@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import dctn, irfft2, next_fast_len, rfft2
-from scipy.special import chdtrc, fdtrc, gammaincinv
+from scipy.special import chdtrc, fdtrc, gammaincinv, gammaln
 
 from ...array_types import BoolArray, FloatArray
 from ...effects import AMPLIFIERS, ImageGeometry
@@ -25,6 +26,8 @@ NEAREST_ECHO = 4
 """Cells below which a moved copy of the image is no echo: diffusion and thickness do that as well."""
 
 LEAST_OVERLAP = 0.1  # Part of the image that a copy must share with the sensor
+
+REACH = 12.0  # Terms of a mixture by Poisson on both sides of the largest [standard deviations]
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,10 +113,20 @@ def _feature_channel(name: str, columns: Columns, state: State, imprecision: flo
 def chance_beyond(statistic: float, degrees: float, noncentrality: float = 0.0) -> float:
     """Chance that a χ² is at least as large."""
     if noncentrality > 0.0:
-        from scipy.stats import ncx2  # slow to import
-
-        return float(ncx2.sf(statistic, degrees, noncentrality))
+        return _chance_beyond(max(statistic, 0.0), degrees, 0.5 * noncentrality)
     return float(chdtrc(degrees, max(statistic, 0.0)))
+
+
+def _chance_beyond(statistic: float, degrees: float, half: float) -> float:
+    """The same of a χ² about a mean that is not 0: a mixture by Poisson of central ones (Johnson et al. 1995).
+
+    Far out the largest terms are those about half of the root of the product (scipy.stats takes a second to import).
+    """
+    largest = max(half, math.sqrt(0.5 * half * statistic))
+    number = np.arange(max(math.floor(half - REACH * (math.sqrt(half) + 1.0)), 0),
+                       math.ceil(largest + REACH * (math.sqrt(largest) + 1.0)))  # fmt: skip
+    share = np.exp(number * math.log(half) - half - gammaln(number + 1.0))
+    return min(float((share * chdtrc(degrees + 2.0 * number, statistic)).sum()), 1.0)
 
 
 def phase_features(state: State, geometry: ImageGeometry, index: FloatArray) -> PlaneColumns:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.polynomial.hermite_e import hermegauss
 from scipy.interpolate import RectBivariateSpline
 from scipy.special import erf
 
-from ...array_types import FloatArray
+from ...array_types import BoolArray, FloatArray
 from ...compiled import contiguous, kernel
 
 LEAST_SPREAD_UM2 = 1e-14  # Variance of the thickness in a cell that is rounding [µm²]
@@ -67,6 +67,11 @@ class CellShape:
         return cls(
             first, np.stack([derivative(2, 0), derivative(1, 1), derivative(0, 2)]), cell_px, area, edge
         )
+
+    def of_cells(self, inside: BoolArray) -> CellShape:
+        """The same of those cells of which ``inside`` (N,) is true."""
+        edge = None if self.edge_px is None else self.edge_px[:, inside]
+        return replace(self, gradient=self.gradient[:, inside], hessian=self.hessian[:, inside], edge_px=edge)
 
     def nodes(self, blur_px: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """Places of every cell about its own thickness [µm], and their weights; each ``(M, N)``.

@@ -7,16 +7,17 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.polynomial.hermite_e import hermegauss
 
-from ...array_types import FloatArray
+from ...array_types import BoolArray, FloatArray
 from ...effects import Effect, ImageGeometry, activate_effects, apply_to_image
 from ...effects.active import ActiveEffect, another
 from ...model import FringeModel
 from ...optics.illumination import Illumination
+from ...optics.phase_response import PhaseResponse
 from ..discovery.evaluations import note_evaluation
 from ..exposures import Exposures
 from .cell_average import CellShape, look_up
@@ -24,6 +25,8 @@ from .cell_average import CellShape, look_up
 Settings = Mapping[str, float]
 _Key = tuple[tuple[str, float], ...]
 _Nodes = tuple[FloatArray, FloatArray]
+Light = tuple[FloatArray, FloatArray]
+_Kept = TypeVar("_Kept")
 
 TABLE_STEP_UM = 0.004
 """Spacing of the thickness grid [µm]: 75 per fringe order; cubic interpolation is good to 1e-6."""
@@ -40,7 +43,7 @@ RIM_PLACES = 3  # Places along an axis that stand for a blur where it crosses th
 
 PHASE_STEP_NM = 0.5  # Spacing of wavelength nodes where the mean phase of a line is all that is asked [nm]
 
-MOST_PARTS = 4  # Sets of islands whose places are kept for reuse
+MOST_PARTS = 4  # Sets of islands, and of effects on the image, that are kept for reuse
 
 MOST_TABLES = 400  # Tables kept for reuse; which of them are there changes no answer
 
@@ -66,8 +69,11 @@ class Forward:
     # answers about points that are kept as long as the model, by the name of the function
     kept: dict[str, dict[Any, Any]] = field(default_factory=dict, repr=False)
     _tables: dict[_Key, FloatArray] = field(default_factory=dict, repr=False)
-    _rows: dict[tuple[_Key, int, float], FloatArray] = field(default_factory=dict, repr=False)
+    _levels: dict[_Key, FloatArray] = field(default_factory=dict, repr=False)
+    _rows: dict[tuple[_Key, int, float], tuple[FloatArray, float]] = field(default_factory=dict, repr=False)
     _by_name: dict[str, Effect] = field(default_factory=dict, repr=False)
+    _of_key: dict[str, Effect] = field(default_factory=dict, repr=False)
+    _images: dict[_Key, tuple[tuple[ActiveEffect, ...], float]] = field(default_factory=dict, repr=False)
     _phases: dict[_Key, float] = field(default_factory=dict, repr=False)
     _parts: dict[tuple[Any, ...], tuple[list[FloatArray], list[_Nodes]]] = field(
         default_factory=dict, repr=False
@@ -95,29 +101,73 @@ class Forward:
 
     def effect_of(self, key: str) -> Effect:
         """The effect that a setting belongs to."""
-        name = key.partition(".")[0]
-        if name not in self._by_name:
-            self._by_name[name] = another(name, self._by_name)
-        return self._by_name[name]
+        if key not in self._of_key:
+            name = key.partition(".")[0]
+            if name not in self._by_name:
+                self._by_name[name] = another(name, self._by_name)
+            self._of_key[key] = self._by_name[name]
+        return self._of_key[key]
 
     def predict(self, settings: Settings, thickness_um: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Signal of the cells relative to its mean level, and its derivative with respect to thickness [1/µm].
 
         ``thickness_um`` (N,): thickness in the middle of the cells. Returns two arrays ``(W, N)``.
         """
-        note_evaluation()
+        return self.imaged(settings, self.light(settings, thickness_um))
+
+    def light(self, settings: Settings, thickness_um: FloatArray) -> Light:
+        """The same before effects on the image, but for their blur."""
         everything = {**self.model.effect_settings, **settings}
-        image = {key: value for key, value in everything.items() if self.effect_of(key).acts_on == "image"}
-        optical = {key: value for key, value in everything.items() if key not in image}
-        value, slope = self._light(optical, thickness_um, self._blur_px(image))
-        value, slope = 1.0 + self.contrast * (value - 1.0), self.contrast * slope
-        image = {key: value for key, value in image.items() if not self._is_blur(self.effect_of(key))}
-        if not any(
-            not item.is_null(self.model.base_system) for item in activate_effects(image, self.catalogue)
-        ):
-            return value, slope
-        changed = self._on_image(image, value)
-        return changed, (self._on_image(image, value + NUDGE_UM * slope) - changed) / NUDGE_UM
+        optical = {key: value for key, value in everything.items() if self.effect_of(key).acts_on != "image"}
+        value, slope = self._light(optical, thickness_um, self._image_of(everything)[1])
+        return 1.0 + self.contrast * (value - 1.0), self.contrast * slope
+
+    def imaged(self, settings: Settings, light: Light) -> Light:
+        """What effects on the image make of the light of some settings."""
+        note_evaluation()
+        active, _ = self._image_of({**self.model.effect_settings, **settings})
+        if not active:
+            return light
+        value, slope = light
+        changed = self._on_image(active, value)
+        return changed, (self._on_image(active, value + NUDGE_UM * slope) - changed) / NUDGE_UM
+
+    def is_of_image(self, key: str) -> bool:
+        """Whether a setting leaves the light as it is."""
+        effect = self.effect_of(key)
+        return effect.acts_on == "image" and not self._is_blur(effect)
+
+    def _image_of(self, settings: Settings) -> tuple[tuple[ActiveEffect, ...], float]:
+        """Effects on the image that do something, and the blur of all others [px]; the latest are kept."""
+        image = {key: value for key, value in settings.items() if self.effect_of(key).acts_on == "image"}
+        if not image:
+            return (), 0.0
+        key = tuple(image.items())
+        if key not in self._images:
+            if len(self._images) >= MOST_PARTS:
+                self._images.clear()
+            active = activate_effects(image, self.catalogue)
+            blurs = [item.effect.blur_px(item.values) for item in active if self._is_blur(item.effect)]
+            rest = tuple(item for item in active if not self._is_blur(item.effect))
+            some = not all(item.is_null(self.model.base_system) for item in rest)
+            self._images[key] = rest if some else (), math.hypot(*blurs)
+        return self._images[key]
+
+    def on_image(self, settings: Settings) -> bool:
+        """Whether effects change the image, so that cells may depend on each other; blurs do not."""
+        return any(self.is_of_image(key) for key in {**self.model.effect_settings, **settings})
+
+    def of_cells(self, rows: slice, columns: slice, inside: BoolArray) -> Forward:
+        """The same of the cells of some rows and columns, ``inside`` (N,) is true of them."""
+        geometry = self.geometry
+        return replace(
+            self,
+            geometry=replace(geometry, y_px=geometry.y_px[rows], x_px=geometry.x_px[columns]),
+            shape=self.shape.of_cells(inside),
+            centroid=None if self.centroid is None else self.centroid[..., inside],
+            place_weight=None if self.place_weight is None else self.place_weight[:, inside],
+            _parts={},
+        )
 
     def _light(
         self, optical: Settings, thickness_um: FloatArray, blur_px: float
@@ -199,8 +249,7 @@ class Forward:
             np.einsum("kn,kwn->wn", self.place_weight, rows.reshape(-1, self.waves, rows.shape[1]))
         )
 
-    def _on_image(self, settings: Settings, value: FloatArray) -> FloatArray:
-        active = activate_effects(settings, self.catalogue)
+    def _on_image(self, active: tuple[ActiveEffect, ...], value: FloatArray) -> FloatArray:
         image = value.reshape(self.waves, *self.geometry.sample_shape)
         return apply_to_image(active, self.model.base_system, image, self.geometry).reshape(value.shape)
 
@@ -209,13 +258,6 @@ class Forward:
         """Whether all that an effect on the image does is to spread signal alike."""
         return type(effect).blur_px is not Effect.blur_px
 
-    def _blur_px(self, image: Settings) -> float:
-        """Blur of all effects, which is a spread of the thickness where that changes evenly."""
-        active = activate_effects(image, self.catalogue)
-        return math.hypot(
-            *(item.effect.blur_px(item.values) for item in active if self._is_blur(item.effect))
-        )
-
     def _log_phase(self, settings: Settings) -> float:
         everywhere = {
             key: value
@@ -223,13 +265,13 @@ class Forward:
             if self.effect_of(key).acts_on != "image" and not self.effect_of(key).local
         }
         key = tuple(sorted(everywhere.items()))
-        if key not in self._phases:
-            if len(self._phases) > MOST_TABLES:
-                self._phases.clear()
+        if key not in self._phases and self.exposures is None:
+            self._tables.pop(key, None)
+            self.table(everywhere)  # which tells it too
+        elif key not in self._phases:
             system = self._model(everywhere).system
             light = system.flat_fields(self.geometry.wavelength_nm, PHASE_STEP_NM)
-            phase = system.reduce(light).kappa[0].real  # of every state but harmonics that were added
-            self._phases[key] = float(np.log(np.average(phase, axis=1, weights=light.weight)).mean())
+            _keep(self._phases, key, float(_log_phases(system.reduce(light), light).mean()))
         return self._phases[key]
 
     # Tables ---------------------------------------------------------------------------------------------------
@@ -249,13 +291,17 @@ class Forward:
         key = tuple(sorted(settings.items()))
         if key not in self._tables:
             response = self._response(settings)
-            self._keep(key, response / self._level(response))
+            _keep(self._levels, key, self._level(response))
+            _keep(self._tables, key, response / self._levels[key])
         return self._tables[key]
 
     def _island_table(self, key: _Key, everywhere: Settings, model: FringeModel) -> FloatArray:
         """The same where a local effect is, over the mean of all other places."""
         if key not in self._tables:
-            self._keep(key, self._fresh(model) / self._level(self._response(everywhere)))
+            around = tuple(sorted(everywhere.items()))
+            if around not in self._levels:
+                _keep(self._levels, around, self._level(self._response(everywhere)))
+            _keep(self._tables, key, self._fresh(model)[0] / self._levels[around])
         return self._tables[key]
 
     @property
@@ -267,24 +313,33 @@ class Forward:
         mean = np.average(response, axis=1, weights=self._taper).reshape(-1, self.waves).mean(axis=0)
         return np.resize(mean, len(response))[:, np.newaxis]
 
-    def _fresh(self, model: FringeModel) -> FloatArray:
-        """Response of all exposures on the grid of thickness."""
+    def _fresh(self, model: FringeModel) -> tuple[FloatArray, FloatArray]:
+        """Response of all exposures on the grid of thickness, and of flats the logarithms of their phases."""
         if self.exposures is not None:
-            return self.exposures.response(model, self.range_um[0], TABLE_STEP_UM, self._count)
+            own = self.exposures.response(model, self.range_um[0], TABLE_STEP_UM, self._count)
+            return own, np.zeros(0)
         light = model.system.flat_fields(self.geometry.wavelength_nm, LINE_STEP_NM)
         return self._grid_response(model, light, slice(None))
 
-    def _keep(self, key: _Key, table: FloatArray) -> None:
-        self._tables[key] = table
-        if len(self._tables) > MOST_TABLES:
-            self._tables.pop(next(iter(self._tables)))
-
     def _response(self, settings: Settings) -> FloatArray:
-        """Response of all exposures; those whose wavelength stays are not computed again."""
+        """Response of all exposures; those whose wavelength stays are not computed again.
+
+        The mean logarithm of the phase of flats is kept beside.
+        """
         model = self._model(settings)
         moving = {key for key in settings if self.effect_of(key).search.moves_wavelengths}
         if self.exposures is not None or (settings and not moving):
-            return self._fresh(model)
+            response, phases = self._fresh(model)
+        else:
+            response, phases = self._with_known_rows(model, settings, moving)
+        if phases.size:
+            _keep(self._phases, tuple(sorted(settings.items())), float(phases.mean()))
+        return response
+
+    def _with_known_rows(
+        self, model: FringeModel, settings: Settings, moving: set[str]
+    ) -> tuple[FloatArray, FloatArray]:
+        """The same as `_fresh` of flats, with the exposures that are known."""
         light = model.system.flat_fields(self.geometry.wavelength_nm, LINE_STEP_NM)
         rest = tuple(sorted((key, value) for key, value in settings.items() if key not in moving))
         keys = [(rest, row, float(first)) for row, first in enumerate(light.wavelength_nm[:, 0])]
@@ -293,13 +348,31 @@ class Forward:
             if len(self._rows) > MOST_TABLES:
                 self._rows.clear()
                 fresh = list(range(self.waves))
-            found = self._grid_response(model, light, fresh)
-            self._rows.update({keys[row]: own for row, own in zip(fresh, found, strict=True)})
-        return np.stack([self._rows[key] for key in keys])
+            found = zip(*self._grid_response(model, light, fresh), strict=True)
+            self._rows.update(
+                {keys[row]: (own, float(phase)) for row, (own, phase) in zip(fresh, found, strict=True)}
+            )
+        rows, phases = zip(*(self._rows[key] for key in keys), strict=True)
+        return np.stack(rows), np.array(phases)
 
-    def _grid_response(self, model: FringeModel, light: Illumination, rows: list[int] | slice) -> FloatArray:
+    def _grid_response(
+        self, model: FringeModel, light: Illumination, rows: list[int] | slice
+    ) -> tuple[FloatArray, FloatArray]:
         part = Illumination(light.wavelength_nm[rows], light.theta[rows], light.weight[rows])
-        wavelength = self.geometry.wavelength_nm[rows]
-        return model.respond_on_grid(
-            part, self.range_um[0], TABLE_STEP_UM, self._count, wavelength, tolerance=TABLE_TOLERANCE
+        wavelength, reduced = self.geometry.wavelength_nm[rows], model.system.reduce(part)
+        response = reduced.averaged_on_grid(
+            part.weight, self.range_um[0], TABLE_STEP_UM, self._count, tolerance=TABLE_TOLERANCE
         )
+        return model.finish(reduced, part, response, wavelength), _log_phases(reduced, part)
+
+
+def _log_phases(reduced: PhaseResponse, light: Illumination) -> FloatArray:
+    """Logarithm of the mean phase per thickness of every exposure, of its states but harmonics that were added."""
+    return np.asarray(np.log(np.average(reduced.kappa[0].real, axis=1, weights=light.weight)))
+
+
+def _keep(kept: dict[_Key, _Kept], key: _Key, value: _Kept) -> None:
+    """Keep a value for reuse, and of all values the latest."""
+    kept[key] = value
+    if len(kept) > MOST_TABLES:
+        kept.pop(next(iter(kept)))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
 from typing import TypeVar
 
 import numpy as np
 
 from ...array_types import BoolArray, FloatArray
-from .forward import Forward
+from .forward import Forward, Light
 
 SECOND_STEP_UM = 1e-3  # Change of thickness with which the slope is differentiated [µm]
 
@@ -82,13 +82,49 @@ def kept(most: int) -> Callable[[Callable[[About], Answer]], Callable[[About], A
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Whitened derivatives with respect to K dense parameters, and what they do to the log determinant of a cost."""
+    """Whitened derivatives with respect to K dense parameters, and what they do to the log determinant of a cost.
 
-    value: FloatArray  # (K, W, N)
+    The first L may be of one exposure alone each, in the order of the exposures.
+    """
+
+    value: FloatArray  # (K - L, W, N): of all exposures
     cells: (
         FloatArray  # (K, 2, N): their part along response and thickness of the cells, in units of unit noise
     )
     log_det: FloatArray  # (K,): derivative of the log determinant of the cells, the thickness following
+    alone: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # (L, N): of one exposure
+
+    def __len__(self) -> int:
+        """Number of parameters."""
+        return len(self.log_det)
+
+    def along(self, values: FloatArray) -> FloatArray:
+        """Products with whitened values ``(..., W, N)``, shape ``(K, ...)``."""
+        one = values.reshape(-1, *values.shape[-2:])
+        found = np.empty((len(self), len(one)))
+        levels = len(self.alone)
+        if levels:
+            found[:levels] = np.einsum("ln,kln->lk", self.alone, one[:, :levels])
+        found[levels:] = np.tensordot(self.value, one, axes=([1, 2], [1, 2]))
+        return found.reshape(len(self), *values.shape[:-2])
+
+    def products(self, other: Columns) -> FloatArray:
+        """Products with other columns, ``(K, K')``."""
+        if not len(self.alone):
+            return other.along(self.value).T
+        first = np.zeros((len(self.alone), len(other.alone)))
+        if len(other.alone):
+            np.fill_diagonal(first, np.einsum("ln,ln->l", self.alone, other.alone))
+        levels = np.einsum("ln,kln->lk", self.alone, other.value[:, : len(self.alone)])
+        return np.concatenate([np.concatenate([first, levels], axis=1), other.along(self.value).T])
+
+    def combined(self, step: FloatArray) -> FloatArray:
+        """What a step of the parameters does, ``(W, N)``."""
+        levels = len(self.alone)
+        total = np.tensordot(step[levels:], self.value, axes=1)
+        if levels:
+            total[:levels] += step[:levels, np.newaxis] * self.alone
+        return np.asarray(total)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +142,11 @@ class Point:
     def root(self) -> FloatArray:
         """Inverse standard deviations."""
         return np.sqrt(self.problem.data.weight)
+
+    @cached_property
+    def light(self) -> Light:
+        """The model over level before effects on the image, and its derivative."""
+        return self.problem.forward.light(self.settings, self.thickness_um)
 
     @cached_property
     def response(self) -> FloatArray:
@@ -248,16 +289,12 @@ class Point:
     @cached_property
     def level_columns(self) -> Columns:
         """Those of the levels."""
-        waves = len(self.levels)
         value, slope = self.value * self.root, self.slope * self.root
-        values = np.zeros((waves, *self.value.shape))
-        values[np.arange(waves), np.arange(waves)] = value
         # Each is of one exposure alone.
         along = np.stack([self.response * value, self.steep * value], axis=-2)
         cells = self._forward_solved(along)
-        return Columns(
-            values, cells, self._log_det_change(along, self.response * slope, self.steep * slope, cells)
-        )
+        change = self._log_det_change(along, self.response * slope, self.steep * slope, cells)
+        return Columns(np.zeros((0, *self.value.shape)), cells, change, value)
 
     def _log_det_change(
         self, along: FloatArray, us: FloatArray, ts: FloatArray, cells: FloatArray
@@ -275,7 +312,7 @@ class Point:
         return np.asarray(0.5 * (both + along[..., 0, :] / uu))
 
     @cached_property
-    def _curved(self) -> FloatArray:
+    def curved(self) -> FloatArray:
         """Whitened second derivative with respect to thickness."""
         up, down = (
             self.problem.forward.predict(self.settings, self.thickness_um + sign * SECOND_STEP_UM)[1]
@@ -285,19 +322,19 @@ class Point:
 
     @cached_property
     def _log_det_by_thickness(self) -> FloatArray:
-        along, second = self._along(self.steep), self._curved
+        along, second = self._along(self.steep), self.curved
         return self._log_det_by(
             along, (self.response * second).sum(axis=0), (self.steep * second).sum(axis=0)
         )
 
     def information(self, first: Columns, second: Columns) -> FloatArray:
         """Fisher matrix of dense columns with the cells integrated."""
-        whole = np.tensordot(first.value, second.value, axes=([1, 2], [1, 2]))
+        whole = first.products(second)
         return np.asarray(whole - np.tensordot(first.cells, second.cells, axes=([1, 2], [1, 2])))
 
     def score(self, columns: Columns) -> FloatArray:
         """Derivative of the log likelihood with respect to dense parameters, without that of the determinant."""
-        whole = np.tensordot(columns.value, self.residual, axes=([1, 2], [0, 1]))
+        whole = columns.along(self.residual)
         return np.asarray(whole - np.tensordot(columns.cells, self.residual_cells, axes=([1, 2], [0, 1])))
 
     def unbiased_score(self, columns: Columns) -> FloatArray:
@@ -306,13 +343,13 @@ class Point:
         A cell that follows its noise leaves a mean residual of second order, half of the variance of its thickness
         times the second derivative; a score that falls on many cells would take that for an effect.
         """
-        whole = np.tensordot(columns.value, self.unbiased_residual, axes=([1, 2], [0, 1]))
+        whole = columns.along(self.unbiased_residual)
         return np.asarray(whole - np.tensordot(columns.cells, self.residual_cells, axes=([1, 2], [0, 1])))
 
     @cached_property
     def unbiased_residual(self) -> FloatArray:
         """The whitened residual without what a thickness that follows noise leaves on the average."""
-        return self.residual + 0.5 * self.projected(self._curved * self.thickness_sigma_um**2)
+        return self.residual + 0.5 * self.projected(self.curved * self.thickness_sigma_um**2)
 
     def followed_um(self, step: FloatArray, columns: Columns) -> FloatArray:
         """Change of the thickness that goes with a step of dense parameters [µm]."""
@@ -362,9 +399,10 @@ class Point:
 
 
 def joined(first: Columns, second: Columns) -> Columns:
-    """Columns of two groups of parameters."""
+    """Columns of two groups of parameters; those of single exposures are in the first."""
     return Columns(
         np.concatenate([first.value, second.value]),
         np.concatenate([first.cells, second.cells]),
         np.concatenate([first.log_det, second.log_det]),
+        first.alone,
     )

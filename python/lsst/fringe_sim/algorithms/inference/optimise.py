@@ -77,6 +77,11 @@ def effect_columns(point: Point, items: Sequence[Coordinate], secant: float = SE
         now = point.settings.get(item.key, item.null)
         step = item.difference(now, secant)
         settings = {**point.settings, item.key: now + step}
+        if forward.is_of_image(item.key):
+            value, slope = forward.imaged(settings, point.light)
+            values[row] = point.whitened((value - point.value) / step)
+            slopes[row], phases[row] = point.whitened((slope - point.slope) / step), 0.0
+            continue
         phase = forward.log_phase(settings) - before
         follows = bool(phase) and not item.step and secant == SECANT
         moved_um: FloatArray | float = point.thickness_um * math.expm1(-phase) if follows else 0.0

@@ -50,11 +50,11 @@ class Judged:
         columns = point.level_columns
         if found.items:
             columns = joined(columns, effect_columns(point, found.items))
-        free = len(columns.value)
+        free = len(columns)
         if block is not None:
             columns = joined(columns, block)
         self.columns: Columns = columns
-        self.known = np.diag((np.arange(len(columns.value)) >= free).astype(float))  # precision of priors
+        self.known = np.diag((np.arange(len(columns)) >= free).astype(float))  # precision of priors
         self.state = state_of(point, columns, self.known)
 
     @property
@@ -84,8 +84,8 @@ def state_of(point: Point, columns: Columns, known: FloatArray | float = 0.0) ->
     """
     shape = (len(point.levels), *point.problem.forward.geometry.sample_shape)
     base = point.information(columns, columns) + known
-    step = np.linalg.solve(base, point.score(columns))
-    left = point.projected(point.first_residual - np.tensordot(step, columns.value, axes=1))
+    step = np.asarray(np.linalg.solve(base, point.score(columns)), dtype=float)
+    left = point.projected(point.first_residual - columns.combined(step))
     left = left / np.sqrt(np.maximum(point.noise_share, 0.05))
     root = point.root.reshape(shape)
     flat = Whitener(root, np.zeros(shape), np.zeros(shape[1:]))

@@ -131,7 +131,7 @@ class CellPart(Part):
 
     def _beside(self, flat: FloatArray, cells: FloatArray) -> tuple[FloatArray, FloatArray]:
         levels = self.point.level_columns
-        own = np.tensordot(levels.value, flat, axes=([1, 2], [0, 1]))
+        own = levels.along(flat)
         return cells, own - np.tensordot(levels.cells, cells, axes=([1, 2], [0, 1]))
 
     def projection(self, columns: Columns) -> tuple[Projected, FloatArray]:

@@ -58,7 +58,14 @@ class FrameForecast(FlatForecast):
         )
         centroid = None if forward.centroid is None else np.tile(forward.centroid, (1, 2, 1))
         return replace(
-            forward, geometry=both, centroid=centroid, exposures=exposures, _tables={}, _rows={}, _phases={}
+            forward,
+            geometry=both,
+            centroid=centroid,
+            exposures=exposures,
+            _tables={},
+            _levels={},
+            _rows={},
+            _phases={},
         )
 
     def _of_laboratory(self, model: FringeModel, series: FlatSeries) -> Forward:

@@ -15,6 +15,7 @@ from ...inference import Columns, Coordinate, Hypothesis, Point, effect_columns,
 from ...inference.coordinates import SECANT
 from .pairs import FEW, Joint, Promised
 from .smooth import beside_smooth
+from .window import Window
 
 WIDTHS = np.geomspace(0.03, 30.0, 13)
 """Widths of the prior, in its scales, over which a score is the best: departures may be of any size."""
@@ -84,7 +85,7 @@ class Scorer:
                 degrees = int(few.sum())
         if len(items) == 1 and items[0].side * step[0] < 0.0:
             best, step = -1.0, -step
-        signature = np.tensordot(step, own.value - np.tensordot(across.T, self.columns.value, axes=1), axes=1)
+        signature = own.combined(step) - self.columns.combined(across @ step)
         flat = self.point.projected(signature).ravel()
         fall = max(2.0 * float(gradient @ step) - float(step @ matrix @ step), 0.0)
         unit = flat / max(float(np.linalg.norm(flat)), 1e-300)
@@ -117,18 +118,10 @@ def residuals_of(point: Point) -> Residuals:
 def proposed(effect: Effect, items: tuple[Coordinate, ...], base: Hypothesis) -> Scored | None:
     """What an effect that is sought proposes itself, or nothing."""
     point = base.point
-    best = None
-    for values in effect.propose(residuals_of(point)):
-        try:
-            start = _begun(effect, items, values, point)
-        except OutOfRangeError:
-            continue
-        if best is None or start.cost < best.cost:
-            best = start
+    values = effect.propose(residuals_of(point))
+    best = _best_island(effect, items, values, point) if effect.local else _best_of(items, values, point)
     if best is None:
         return None
-    if effect.local:
-        best = in_best_orders(best, _covered(effect, items, best))
     step = np.array([best.settings[item.key] - item.null for item in items])
     change = point.projected(best.whitened(best.value) - point.whitened(point.value)).ravel()
     unit = change / max(float(np.linalg.norm(change)), 1e-300)
@@ -136,16 +129,52 @@ def proposed(effect: Effect, items: tuple[Coordinate, ...], base: Hypothesis) ->
     return Scored(effect.name, gain, len(items), step, unit, best, max(2.0 * gain, 0.0))
 
 
-def _begun(effect: Effect, items: tuple[Coordinate, ...], values: dict[str, float], point: Point) -> Point:
-    """A proposal with the thickness that goes with it; that of an island may lie anywhere within an order."""
-    if not effect.local:
-        return jumped(point, items, [values[item.parameter] for item in items])
-    settings = {**point.settings, **{item.key: item.clipped(values[item.parameter]) for item in items}}
-    start = point.moved(point.levels, point.thickness_um, settings)
-    return in_best_orders(start, _covered(effect, items, start), rounds=FIRST_ROUNDS)
+def _best_of(
+    items: tuple[Coordinate, ...], proposals: Sequence[dict[str, float]], point: Point
+) -> Point | None:
+    """The best proposal, with the thickness that goes with it."""
+    best = None
+    for values in proposals:
+        try:
+            start = jumped(point, items, [values[item.parameter] for item in items])
+        except OutOfRangeError:
+            continue
+        if best is None or start.cost < best.cost:
+            best = start
+    return best
 
 
-def _covered(effect: Effect, items: tuple[Coordinate, ...], point: Point) -> BoolArray:
+def _best_island(
+    effect: Effect, items: tuple[Coordinate, ...], proposals: Sequence[dict[str, float]], point: Point
+) -> Point | None:
+    """The same of a local effect: the thickness on an island may lie anywhere within an order.
+
+    No cell beyond it changes, so that only those about it are compared.
+    """
+    windows: dict[bytes, Window] = {}
+    best: tuple[float, Window, Point, BoolArray] | None = None
+    for values in proposals:
+        settings = {**point.settings, **{item.key: item.clipped(values[item.parameter]) for item in items}}
+        covered = _covered(effect, items, settings, point)
+        if not covered.any():
+            continue
+        window = windows.setdefault(covered.tobytes(), Window.about(point, covered))
+        part, where = window.point, covered[window.inside]
+        try:
+            start = in_best_orders(
+                part.moved(part.levels, part.thickness_um, settings), where, rounds=FIRST_ROUNDS
+            )
+        except OutOfRangeError:
+            continue
+        gain = part.cost - start.cost
+        if best is None or gain > best[0]:
+            best = gain, window, start, where
+    return None if best is None else best[1].joined(in_best_orders(best[2], best[3]))
+
+
+def _covered(
+    effect: Effect, items: tuple[Coordinate, ...], settings: dict[str, float], point: Point
+) -> BoolArray:
     """Cells in which a local effect is."""
-    values = {item.parameter: point.settings[item.key] for item in items}
+    values = {item.parameter: settings[item.key] for item in items}
     return np.asarray(effect.coverage(values, point.problem.forward.geometry).ravel() > 0.0)
