@@ -185,6 +185,21 @@ class CellLesson:
         """Rms of the noise."""
         return self.cells.noise_rms
 
+    def in_all_data(self, unchanged: Point) -> tuple[Hypothesis, Hypothesis]:
+        """The unchanged model and the effects, fitted to all cells.
+
+        ``unchanged``: the model without the effects at the cells searched and those held out.
+        """
+        null = fit((), (), self.problem.at({}, unchanged.levels, unchanged.thickness_um))
+        own = self.start
+        found = fit(
+            self.found.effects,
+            self.found.items,
+            self.problem.at(own.settings, own.levels, own.thickness_um),
+            aim=null.point.cost,
+        )
+        return null, found
+
     def teaching(self) -> CellPart:
         """The cells that teach, with the effects fitted to them."""
         start = self._at(~self.judged, self.start, self.start.settings)
@@ -206,6 +221,12 @@ class CellLesson:
         """The data of some of the cells, near a point."""
         problem = replace(self.problem, data=data_of(self.cells.restricted(cells)))
         return problem.at(settings, point.levels, point.thickness_um)
+
+
+def in_all_data(prepared: Prepared, found: Hypothesis) -> tuple[Hypothesis, Hypothesis]:
+    """The unchanged model and a set that was fitted to the part searched, both fitted to all data after selection."""
+    lesson = CellLesson.of(prepared, found)
+    return lesson.in_all_data(unseen_too(prepared, with_corrections(prepared.point), together(prepared)))
 
 
 def _point_of(part: Part) -> Point:
