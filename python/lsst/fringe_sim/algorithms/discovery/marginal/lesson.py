@@ -42,8 +42,9 @@ def in_all_cells(point: Point, cells: CellData) -> Point:
     """
     field = continued(point.thickness_um.reshape(cells.shape[1:]), cells.seen)
     known = float(np.median(point.thickness_sigma_um[cells.seen.ravel()]))
-    shape = CellShape.of_field(field, cells.cell_px, max(known, neighbour_scatter(field, cells.seen, 0.0)))
-    problem = replace(point.problem, forward=replace(point.problem.forward, shape=shape))
+    error, forward = max(known, neighbour_scatter(field, cells.seen, 0.0)), point.problem.forward
+    shape = CellShape.of_field(field, cells.cell_px, error, area=forward.shape.area)
+    problem = replace(point.problem, forward=replace(forward, shape=shape))
     return problem.at(point.settings, point.levels, point.thickness_um)
 
 
