@@ -51,6 +51,7 @@ class SetSearch:
         self._added_before: set[tuple[frozenset[str], str]] = set()
         self._short: set[tuple[frozenset[str], str]] = set()  # fits that came far behind before
         self._brought: dict[str, float] = {}  # most log evidence that an effect brought where it was fitted
+        self._exchanged: set[frozenset[str]] = set()  # sets whose members were left out and exchanged
 
     def posterior(self, found: Hypothesis) -> float:
         """Log evidence less the price of the effects."""
@@ -104,6 +105,8 @@ class SetSearch:
                 if self.catalogue.may_leave((name,), larger.effects)
             ]
             smaller = max([smaller, *map(self._keep, others)], key=self.posterior)
+            if len(smaller.effects) > 1 and not self._is_surely_better(larger, smaller):
+                smaller = self._settled(smaller)  # it may be what is left of a larger one, its twins not fitted
         return larger if self._is_surely_better(larger, smaller) else smaller
 
     def _from_thickness(self, found: Hypothesis, other: Hypothesis) -> Hypothesis:
@@ -134,6 +137,7 @@ class SetSearch:
         """The same search of a problem that was judged again; the best sets are fitted from where they are."""
         again = SetSearch(self.catalogue, null, self.rules, self.say, self.leaves_noise, pace=self.pace)
         again._brought.update(self._brought)
+        again._exchanged.update(self._exchanged)
         known = sorted(self.pool.values(), key=self.posterior, reverse=True)
         top = known[0].log_evidence - self.null.log_evidence
         # With one effect of several the noise is still that of a wrong model.
@@ -214,7 +218,8 @@ class SetSearch:
 
     def _settled(self, found: Hypothesis) -> Hypothesis:
         """The best set after members were left out and exchanged, as long as that helps."""
-        while True:
+        while frozenset(found.effects) not in self._exchanged:
+            self._exchanged.add(frozenset(found.effects))
             for name in found.effects:
                 if self.catalogue.may_leave((name,), found.effects):
                     self._grow(self.without(found, name), missing=name)
@@ -225,9 +230,8 @@ class SetSearch:
                 (one for one in self.pool.values() if len(one.effects) <= len(found.effects)),
                 key=self.posterior,
             )
-            if self.posterior(best) <= self.posterior(found) or len(best.effects) < len(found.effects):
-                return max(best, found, key=self.posterior)
-            found = best
+            found = max(best, found, key=self.posterior)
+        return found
 
     def without(self, found: Hypothesis, name: str) -> Hypothesis:
         """The set without one member, fitted from where it is, or the better one that is known."""
