@@ -218,7 +218,10 @@ class SkyExposures:
             for item in model.effects
             if item.effect.acts_on not in ("spectrum", "response", "image")
         )
-        key = (*key, model.base_system.beam.theta.tobytes())
+        # The model of an island has no effect for it; its layers are in the stack before all effects.
+        beam = model.base_system.beam
+        before = replace(model.base_system, beam=self.base.base_system.beam)
+        key = (*key, before, beam.theta.tobytes(), beam.weight.tobytes())
         if key not in self._reduced:
             while len(self._reduced) >= _KEPT:
                 self._reduced.pop(next(iter(self._reduced)))
