@@ -271,7 +271,7 @@ class SetSearch:
     # Growth -----------------------------------------------------------------------------------------------------
 
     def _grow(self, base: Hypothesis, missing: str = "", most: int | None = None) -> None:
-        """Refit the best of each group of twins beside a set, and all of the group that wins.
+        """Refit the best of each group of twins beside a set, and twins that may win.
 
         ``missing``: a member of a larger set that was taken out here; its twins are refitted in any case.
         """
@@ -291,16 +291,29 @@ class SetSearch:
                 found[group[0].name] = self._added(base, group[0])
         if not found:
             return
-        top = max(self.posterior(one) for one in found.values())
-        alike = {name for name, one in found.items() if self.posterior(one) > top - self.rules.class_width}
+        least = max(self.posterior(one) for one in found.values()) - self.rules.class_width
         for group in groups:
-            names = {one.name for one in group}
-            self.pace.left = len(group)
-            if alike & names or missing in names:
-                kept = self._kept(base, group)
-                for one in group:
-                    if one.name != missing and self._may_lead(base, one, kept):
-                        self._added(base, one)
+            first = found.get(group[0].name)
+            near = missing in {one.name for one in group} or (
+                first is not None and self.posterior(first) > least
+            )
+            if near or first is not None:
+                self._add_twins(base, [one for one in group if one.name != missing], least, near)
+
+    def _add_twins(self, base: Hypothesis, group: Sequence[Scored], least: float, near: bool) -> None:
+        """Refit the twins of an effect that came near the best, or did not bring what they promise.
+
+        An effect that derivatives mislead says nothing of its twins. They are refitted as far as they come near the
+        best if they bring what they promise, and as soon as one does, those that may bring a little more.
+        ``least``: posterior from which on a set is near the best.
+        """
+        self.pace.left = len(group)
+        kept = self._kept(base, group) if near else self.rules.least_of_promise
+        for one in group:
+            if not self._may_lead(base, one, kept):
+                continue
+            if self.posterior(self._added(base, one)) > least and not near:
+                near, kept = True, self._kept(base, group)
 
     def _kept(self, base: Hypothesis, group: Sequence[Scored]) -> float:
         """How many times what derivatives promise an effect of a group of twins has brought, 1 at least."""
