@@ -98,7 +98,7 @@ class CellPart(Part):
     @property
     def rms(self) -> float:
         """Rms of data minus model, corrected for the freedom of all that is fitted."""
-        return self.noise_rms * self.point.misfit(len(self.point.levels))
+        return self.noise_rms * self.point.misfit(self.point.problem.free_levels)
 
     @property
     def planes(self) -> int:
@@ -141,7 +141,8 @@ class CellPart(Part):
         cells = point._forward_solved(np.stack([own.reshape(len(own), -1) for own in along], axis=1))
         planes = np.arange(len(point.levels))
         whiten = self.state.whiten
-        own_levels = PlaneColumns(self._image(point.value * point.root), planes, np.eye(len(planes)), whiten)
+        design = point.problem.level_design
+        own_levels = PlaneColumns(self._image(point.value * point.root), planes, design, whiten)
         both = ([1, 2], [1, 2])
         cross = columns.against(own_levels) - np.tensordot(cells, levels.cells, axes=both)
         within = np.linalg.solve(point.information(levels, levels), cross.T)

@@ -199,7 +199,8 @@ class SetSearch:
     def _in_orders(self, size: int) -> list[Hypothesis]:
         """All sets of so many effects, the best of them in other fringe orders too where none leaves noise."""
         grown = self._of_size(size)
-        if not grown or self.null.point.problem.known or self.leaves_noise(grown[0]):
+        problem = self.null.point.problem
+        if not grown or problem.known or problem.orders or self.leaves_noise(grown[0]):
             return grown
         for found in grown[: self.rules.beam]:
             point, order_um = found.point, found.point.problem.forward.order_um

@@ -65,12 +65,12 @@ class MarginalSearch:
         self.prepared, self.model, self.rules, self.report = prepared, model, rules, report
         self.options, self.rng, self.until = options, rng, math.inf
         # On the sky the errors of the tables are those of the map too.
-        self.teaches = exposures is None
+        self.teaches = exposures is None and not prepared.few
         stack = model.system.stack
         medium = stack.layers[stack.position(model.system.varying)].medium
         wavelength = prepared.cells.wavelength_nm
         self.index = np.real(medium.index(wavelength, model.system.temperature_k))
-        self.notes = [*headers_apart(cube, model), "searched by one likelihood (core marginal)"]
+        self.notes = [*headers_apart(cube, model), "searched by one likelihood (core marginal)", *prepared.told]
         self._judged_with: list[set[str]] = []
         self._judged: dict[tuple[Hypothesis, Hypothesis], tuple[Channel, ...]] = {}
         self.catalogue = Catalogue.of(effects, prepared.problem.forward, rules.most_effects)
