@@ -61,6 +61,12 @@ class Problem:
         """How many parameters the levels have, the first of all dense ones."""
         return len(self.data.value) if self.level_shapes is None else self.level_shapes.shape[1]
 
+    @property
+    def freedom(self) -> int:
+        """Values beyond what cells and levels have for themselves; a response, and a thickness that is not known."""
+        own = (1 if self.known else 2) * int(self.data.seen.sum())
+        return int(np.count_nonzero(self.data.weight)) - own - self.free_levels
+
     def at(self, settings: Mapping[str, float], levels: FloatArray, thickness_um: FloatArray) -> Point:
         """The likelihood linearised about effects, levels ``(W,)`` and thickness ``(N,)``."""
         value, slope = self.forward.predict(settings, thickness_um)

@@ -266,14 +266,14 @@ def fit(
     back = _gone_back(point)
     if point.cost - back.cost > _tolerance(back, aim, tolerance):
         point = _walked(items, back, rounds, aim, tolerance)
-    for start in _in_other_orders(point):
+    for start in in_open_orders(point):
         other = _walked(items, start, rounds, min(aim, point.cost), tolerance)
         point = min(point, other, key=lambda one: _target(one, items))
     return _hypothesis(effects, items, point)
 
 
-def _in_other_orders(point: Point) -> list[Point]:
-    """The point with all cells in the fringe orders that are open, as far as the tables reach."""
+def in_open_orders(point: Point) -> list[Point]:
+    """The point with all cells in each of the other fringe orders that are open, as far as the tables reach."""
     forward, found = point.problem.forward, []
     low, high = forward.range_um
     for turn in range(-point.problem.orders, point.problem.orders + 1):

@@ -73,11 +73,16 @@ class Prepared:
         return self.problem.level_shapes is not None
 
     @property
+    def measured(self) -> bool:
+        """Whether the noise is that of the data, not as stated."""
+        return is_measured(self.cells.seen)
+
+    @property
     def told(self) -> tuple[str, ...]:
         """What is believed and not measured, for the verdict."""
         noise = f"noise taken as stated plus {STATED_UNCERTAINTY:.0%}: too few cells to measure it"
         levels = "flat levels taken as known up to a common factor"
-        return (() if is_measured(self.cells.seen) else (noise,)) + ((levels,) if self.few else ())
+        return (() if self.measured else (noise,)) + ((levels,) if self.few else ())
 
 
 def prepare(
