@@ -245,7 +245,8 @@ def unseen_too(prepared: Prepared, point: Point, cells: CellData) -> Point:
 def together(prepared: Prepared) -> CellData:
     """The part searched and the part held out, which is over a mean of its own, in the same units."""
     cells, unseen = prepared.cells, prepared.unseen
-    ratio = unseen.geometry.level_e / cells.geometry.level_e
+    level = cells.geometry.level_e
+    ratio = np.divide(unseen.geometry.level_e, level, out=np.ones_like(level), where=level > 0.0)
     ratio = np.where(np.isfinite(ratio), ratio, 1.0)[:, np.newaxis, np.newaxis]
     there = unseen.weight > 0.0
     return replace(

@@ -30,7 +30,7 @@ from ..cells import CellData, bin_cube, finest_useful_cell
 from ..continuation import continued
 from ..noise import STATED_UNCERTAINTY
 from ..outliers import spoiled_cells
-from ..preparation import FEWEST_ROWS as FEWEST_FOR_LEVELS
+from ..preparation import are_few
 from ..start import robust_surface, starting_thickness
 from ..validation import BLOCKS_ACROSS, FEWEST_ROWS
 from .known_thickness import as_known, stated_sigma_um, with_error_of_map
@@ -345,7 +345,7 @@ def _problem(
     """Problem about a first thickness ``(ny, nx)``; of a few pixels levels and fringe order are hardly told by data."""
     error = FIRST_ERROR_UM if cells.thickness_um is None else float(np.median(stated_sigma_um(cells)))
     shape = CellShape.of_field(thickness_um, cells.cell_px, error)
-    few = min(cells.shape[1:]) < FEWEST_FOR_LEVELS
+    few = are_few(cells.shape[1:], int(cells.seen.sum()))
     orders = OPEN_ORDERS if few and cells.thickness_um is None else 0
     margin = MARGIN_UM + orders * float(model.fringe_order_um(np.median(cells.wavelength_nm)))
     limits = (max(float(thickness_um.min()) - margin, 0.05), float(thickness_um.max()) + margin)
