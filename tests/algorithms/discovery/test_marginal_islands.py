@@ -143,7 +143,7 @@ def test_all_cells_are_asked_where_effects_join_them(rng: np.random.Generator) -
 
 @pytest.mark.rng("second void beside the first")
 def test_the_second_of_an_effect_is_looked_for_beside_the_first(rng: np.random.Generator) -> None:
-    catalogue = Catalogue.of(EFFECTS, point_of(rng, 0.0).problem.forward, 3)
+    catalogue = Catalogue.of(EFFECTS, point_of(rng, 0.0).problem, 3)
     assert catalogue.before == {"void_2": "void", "void_3": "void_2"}
     assert catalogue.may_add("void", ("bandwidth",))
     assert not catalogue.may_add("void_2", ("bandwidth",))

@@ -38,6 +38,8 @@ def curvature_of(rows: int, columns: int) -> sparse.spmatrix:
 
 
 def _differences(size: int, order: int) -> sparse.spmatrix:
-    """First or second differences of so many values."""
+    """First or second differences of so many values; fewer have none."""
+    if size <= order:
+        return sparse.csr_matrix((0, size))
     signs = {1: (-1.0, 1.0), 2: (1.0, -2.0, 1.0)}[order]
     return sparse.diags(signs, tuple(range(order + 1)), shape=(size - order, size), dtype=float)

@@ -82,11 +82,11 @@ def flats_ranked(
         thickness_um=thickness_um, significance=effect.significance, catalogue=catalogue,
     )  # fmt: skip
     if few and ranked:
-        ranked = (*ranked, _more_pixels(ranked[0], cells))
+        ranked = (*ranked, more_pixels(ranked[0], cells))
     return tuple(sorted(ranked, key=lambda item: -item.separation))
 
 
-def _more_pixels(ranked: RankedMeasurement, cells: CellData) -> RankedMeasurement:
+def more_pixels(ranked: RankedMeasurement, cells: CellData) -> RankedMeasurement:
     """The same flats of many pixels, whatever it is that sets the noise of one."""
     gain = max(MANY_PX / math.sqrt(float(cells.seen.sum()) * cells.cell_px**2), 1.0)
     pairs = [

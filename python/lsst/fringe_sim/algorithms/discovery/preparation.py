@@ -157,6 +157,11 @@ def _span(values: FloatArray) -> str:
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
+def are_few(shape: tuple[int, ...], pixels: int) -> bool:
+    """Whether the mean of so many good pixels in rows and columns is not about that of a fringe."""
+    return min(shape) < FEWEST_ROWS and pixels < FEWEST_OF_A_MEAN
+
+
 def why_too_poor(cube: FringeCube, model: FringeModel) -> str:
     """Why these data cannot answer, or nothing."""
     good = (np.asarray(cube.mask) == 0).reshape(cube.shape[0], -1)
@@ -173,7 +178,7 @@ def why_too_poor(cube: FringeCube, model: FringeModel) -> str:
     ]
     if constant:
         return f"the frame is constant at {', '.join(constant)}: no fringes and no noise, so not data"
-    if cube.unit == "electron" and min(cube.shape[1:]) < FEWEST_ROWS and pixels < FEWEST_OF_A_MEAN:
+    if cube.unit == "electron" and are_few(cube.shape[1:], pixels):
         return (
             f"{pixels} pixel(s) in electrons: their mean is not the level of the flats; give counts relative to the "
             "mean of the whole sensor, or more pixels"

@@ -162,7 +162,7 @@ def search_exposures(
             return stopped or replace(_no_answer(model, reason, cube, too_poor=False), complete=False)
 
 
-MARGINAL_ROWS = 16
+MARGINAL_ROWS = 1
 """Rows and columns of pixels from which on the search on one likelihood can split data into a part that is searched
 and one that is held out, and measure the noise of both: 16 leave as many second differences beside blocks that are
 held out as `marginal.noise` asks for, 12 do not."""

@@ -38,6 +38,9 @@ class Problem:
     response_sigma: float  # prior of the response of a cell
     thickness_sigma_um: float | FloatArray = 10.0  # of all or each; many orders pull no cell and favour none
     known: bool = False  # whether the first thickness is measured: it stays, and no cell changes its order
+    # free shapes of the levels over the exposures, ``(W, L)``: one of every exposure by default
+    level_shapes: FloatArray | None = None
+    orders: int = 0  # on both sides of a fit, in which it is tried too: few wavelengths tell no order
 
     @property
     def phase_share(self) -> float:
@@ -47,6 +50,22 @@ class Problem:
         """
         measured = self.known or np.ndim(self.thickness_sigma_um) > 0
         return 0.0 if measured else 0.5 * float(self.data.seen.sum())
+
+    @property
+    def level_design(self) -> FloatArray:
+        """Change of the levels with what is free of them, ``(W, L)``."""
+        return np.eye(len(self.data.value)) if self.level_shapes is None else self.level_shapes
+
+    @property
+    def free_levels(self) -> int:
+        """How many parameters the levels have, the first of all dense ones."""
+        return len(self.data.value) if self.level_shapes is None else self.level_shapes.shape[1]
+
+    @property
+    def freedom(self) -> int:
+        """Values beyond what cells and levels have for themselves; a response, and a thickness that is not known."""
+        own = (1 if self.known else 2) * int(self.data.seen.sum())
+        return int(np.count_nonzero(self.data.weight)) - own - self.free_levels
 
     def at(self, settings: Mapping[str, float], levels: FloatArray, thickness_um: FloatArray) -> Point:
         """The likelihood linearised about effects, levels ``(W,)`` and thickness ``(N,)``."""
@@ -290,6 +309,9 @@ class Point:
     def level_columns(self) -> Columns:
         """Those of the levels."""
         value, slope = self.value * self.root, self.slope * self.root
+        shapes = self.problem.level_shapes
+        if shapes is not None:
+            return self.columns(*(shapes.T[:, :, np.newaxis] * each for each in (value, slope)))
         # Each is of one exposure alone.
         along = np.stack([self.response * value, self.steep * value], axis=-2)
         cells = self._forward_solved(along)
@@ -390,6 +412,10 @@ class Point:
     def problem_with(self, data: Data) -> Point:
         """The same point of a problem with other data."""
         return replace(self, problem=replace(self.problem, data=data))
+
+    def levels_after(self, step: FloatArray) -> FloatArray:
+        """Levels after a step of what is free of them, the first of a step of all dense parameters."""
+        return np.asarray(self.levels + self.problem.level_design @ step[: self.problem.free_levels])
 
     def moved(
         self, levels: FloatArray, thickness_um: FloatArray, settings: Mapping[str, float] | None = None

@@ -119,7 +119,7 @@ def relaxed(point: Point, rounds: int = 3, tolerance: float = 0.02) -> Point:
         step = np.asarray(np.linalg.solve(point.information(columns, columns), gradient))
         moved = np.clip(point.followed_um(step, columns), -MOST_STEP_UM, MOST_STEP_UM)
         for part in SHRINK[:2]:
-            new = point.moved(point.levels + part * step, point.thickness_um + part * moved)
+            new = point.moved(point.levels_after(part * step), point.thickness_um + part * moved)
             if new.cost < point.cost:
                 break
         else:
@@ -148,7 +148,7 @@ def with_free_contrast(point: Point, rounds: int = 8, tolerance: float = 0.02) -
             contrast = max(forward.contrast + part * float(step[-1]), LEAST_LEFT * forward.contrast)
             problem = replace(point.problem, forward=replace(forward, contrast=contrast))
             new = problem.at(
-                point.settings, point.levels + part * step[:-1], point.thickness_um + part * moved
+                point.settings, point.levels_after(part * step[:-1]), point.thickness_um + part * moved
             )
             if new.cost < point.cost:
                 break
@@ -181,7 +181,7 @@ def jumped(point: Point, items: Sequence[Coordinate], values: Sequence[float]) -
 
     _, first = followed(1.0 / MOST_STRIDES)
     far = MOST_STRIDES * _typical_um(
-        point, first - point.followed_um(np.zeros(len(point.levels)), point.level_columns)
+        point, first - point.followed_um(np.zeros(point.problem.free_levels), point.level_columns)
     )
     strides = min(max(math.ceil(far / STRIDE_UM), 1), MOST_STRIDES)
     for number in range(1, strides + 1):
@@ -266,7 +266,21 @@ def fit(
     back = _gone_back(point)
     if point.cost - back.cost > _tolerance(back, aim, tolerance):
         point = _walked(items, back, rounds, aim, tolerance)
+    for start in in_open_orders(point):
+        other = _walked(items, start, rounds, min(aim, point.cost), tolerance)
+        point = min(point, other, key=lambda one: _target(one, items))
     return _hypothesis(effects, items, point)
+
+
+def in_open_orders(point: Point) -> list[Point]:
+    """The point with all cells in each of the other fringe orders that are open, as far as the tables reach."""
+    forward, found = point.problem.forward, []
+    low, high = forward.range_um
+    for turn in range(-point.problem.orders, point.problem.orders + 1):
+        thickness = point.thickness_um + turn * forward.order_um
+        if turn and low < thickness.min() and thickness.max() < high:
+            found.append(relaxed(point.moved(point.levels, thickness)))
+    return found
 
 
 def _gone_back(point: Point, rounds: int = 4) -> Point:
@@ -320,7 +334,7 @@ def _target(point: Point, items: Sequence[Coordinate]) -> float:
 
 def _step(point: Point, items: Sequence[Coordinate], columns: Columns, information: FloatArray) -> FloatArray:
     """Gauss-Newton step of levels and parameters; those at a bound that want to leave it stay."""
-    waves = len(point.levels)
+    waves = point.problem.free_levels
     gradient = point.score(columns) - columns.log_det
     matrix = information.copy()
     for row, item in enumerate(items, start=waves):
@@ -346,7 +360,7 @@ def _best_of_parts(
     point: Point, items: Sequence[Coordinate], step: FloatArray, moved_um: FloatArray
 ) -> Point | None:
     """The point of the longest part of a step that is better, or nothing."""
-    waves, now = len(point.levels), _target(point, items)
+    waves, now = point.problem.free_levels, _target(point, items)
     longest = min(1.0, STRIDE_UM / max(_typical_um(point, moved_um), 1e-12))
     moved_um = np.clip(moved_um, -MOST_STEP_UM / longest, MOST_STEP_UM / longest)
     for part in longest * np.array(SHRINK):
@@ -356,7 +370,7 @@ def _best_of_parts(
         }
         try:
             new = point.moved(
-                point.levels + part * step[:waves], point.thickness_um + part * moved_um, settings
+                point.levels_after(part * step), point.thickness_um + part * moved_um, settings
             )
         except OutOfRangeError:  # no layer is thinner than nothing
             continue
@@ -371,7 +385,7 @@ def _best_of_parts(
 
 def _hypothesis(effects: Sequence[str], items: Sequence[Coordinate], point: Point) -> Hypothesis:
     """The log evidence of a fit: levels and parameters leave as a Gaussian."""
-    waves, columns = len(point.levels), point.level_columns
+    waves, columns = point.problem.free_levels, point.level_columns
     if items:
         columns = joined(columns, effect_columns(point, items))
     information = point.information(columns, columns)

@@ -11,7 +11,7 @@ import numpy as np
 from ....effects import Effect
 from ....effects.base import numbered
 from ....errors import InputError
-from ...inference import Coordinate, Forward, coordinates_of
+from ...inference import Coordinate, Forward, Problem, coordinates_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,11 +24,12 @@ class Catalogue:
     before: dict[str, str]  # of the second, third, ... of an effect the one before
 
     @classmethod
-    def of(cls, effects: Sequence[Effect], forward: Forward, most: int = 1) -> Catalogue:
+    def of(cls, effects: Sequence[Effect], problem: Problem, most: int = 1) -> Catalogue:
         """Coordinates of all effects of a catalogue that these exposures can see.
 
         ``most``: of an effect of which a sensor may have several.
         """
+        forward = problem.forward
         items: dict[str, tuple[Coordinate, ...]] = {}
         left_out: dict[str, str] = {}
         before: dict[str, str] = {}
@@ -38,6 +39,11 @@ class Catalogue:
                 _try(own, forward)
             except InputError as error:
                 left_out[effect.name] = str(error)
+                continue
+            if len(own) >= problem.freedom:
+                left_out[effect.name] = (
+                    f"{len(own)} parameters, and {problem.freedom} values beyond what cells and levels have"
+                )
                 continue
             if effect.local and type(effect).propose is Effect.propose:
                 left_out[effect.name] = (

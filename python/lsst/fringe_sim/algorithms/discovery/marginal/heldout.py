@@ -23,6 +23,7 @@ from .lesson import (
     with_corrections,
 )
 from .preparation import Prepared
+from .telling import rms_left
 
 ROUNDS = 3
 """How often a stand-in is fitted again about itself, as long as that helps: what it does is hardly linear."""
@@ -35,7 +36,8 @@ STRIDES = (1.0, 0.3, 0.1)  # Parts of the way to a fit that are tried
 class Unseen:
     """Unchanged model against effects, and against a stand-in of equal size."""
 
-    gain: float  # of the log likelihood, with thickness and response of the cells free in both
+    # of the log likelihood, with thickness and response of the cells free in both; nothing without blocks
+    gain: float | None
     before_rms: float
     after_rms: float
     stand_in: str = ""  # what it is; empty where none explains anything
@@ -51,11 +53,12 @@ class Unseen:
 
         ``outsider_prior``: prior probability of such a cause.
         """
-        if self.gain <= 0.0:
+        if self.gain is not None and self.gain <= 0.0:
             return "data held out are not predicted better"
-        if self.gain + self.waves_gain <= 0.0:
-            return "wavelengths that are left out are predicted worse than by the unchanged model"
-        ahead = self.stand_in_gain - self.gain
+        gain = self.gain or 0.0
+        if gain + self.waves_gain <= 0.0:
+            return "wavelengths that are left out are not predicted better than by the unchanged model"
+        ahead = self.stand_in_gain - gain
         if self.stand_in and ahead > math.log((1.0 - outsider_prior) / outsider_prior):
             return (
                 f"{self.stand_in} with as many parameters predicts data held out better, by a log likelihood of "
@@ -67,9 +70,10 @@ class Unseen:
     def text(self) -> str:
         """One line for the notes."""
         other = f", with {self.stand_in} of equal size by {self.stand_in_gain:.1f}" if self.stand_in else ""
+        blocks = "" if self.gain is None else f"of blocks rises by {self.gain:.1f}{other}; that "
         return (
-            f"held out: the log likelihood of blocks rises by {self.gain:.1f}{other}; that of every fourth "
-            f"wavelength, left out of the fit, by {self.waves_gain:.1f}"
+            f"held out: the log likelihood {blocks}of wavelengths that are left out of the fit rises by "
+            f"{self.waves_gain:.1f}"
         )
 
 
@@ -82,10 +86,12 @@ def rms_unseen(prepared: Prepared) -> float | None:
     return CellPart(own, prepared.unseen.noise_rms).rms
 
 
-def judge_unseen(prepared: Prepared, found: Hypothesis) -> Unseen | None:
-    """Compare a set with the unchanged model on the part held out; nothing where there is none."""
+def judge_unseen(prepared: Prepared, found: Hypothesis) -> Unseen:
+    """Compare a set with the unchanged model on the part held out, and on wavelengths that are left out."""
     if not prepared.unseen.seen.any():
-        return None
+        gain = _gain_of_single_waves if prepared.few else _gain_of_waves
+        rms = (rms_left(prepared, one) for one in (prepared.null, found))
+        return Unseen(None, *rms, waves_gain=gain(prepared, found))
     noise, cells = prepared.unseen.noise_rms, together(prepared)
     whole = _whole(prepared, found.point)
     shape = whole.problem.forward.shape  # all are judged with cells as the best thickness shapes them
@@ -129,6 +135,23 @@ def _gain_of_waves(prepared: Prepared, found: Hypothesis) -> float:
     out = (np.arange(waves) % 4 == 2)[:, np.newaxis]
     before, after = (_cost_of_waves(one, out) for one in (prepared.null, found))
     return before - after
+
+
+def _gain_of_single_waves(prepared: Prepared, found: Hypothesis) -> float:
+    """The same of every wavelength in turn, predicted by all others: levels, cells and effects are integrated."""
+    return sum(
+        sign * (one.log_evidence - _without_wave(one, wave).log_evidence)
+        for one, sign in ((found, 1.0), (prepared.null, -1.0))
+        for wave in range(len(found.point.levels))
+    )
+
+
+def _without_wave(found: Hypothesis, wave: int) -> Hypothesis:
+    """A set fitted to all exposures but one."""
+    point, data = found.point, found.point.problem.data
+    out = (np.arange(len(data.weight)) == wave)[:, np.newaxis]
+    rest = point.problem_with(Data(data.value, np.where(out, FAINT, 1.0) * data.weight))
+    return fit(found.effects, found.items, rest)
 
 
 def _cost_of_waves(found: Hypothesis, out: BoolArray) -> float:

@@ -99,7 +99,7 @@ class CellPart(Part):
     @property
     def rms(self) -> float:
         """Rms of data minus model, corrected for the freedom of all that is fitted."""
-        return self.noise_rms * self.point.misfit(len(self.point.levels))
+        return self.noise_rms * self.point.misfit(self.point.problem.free_levels)
 
     @property
     def planes(self) -> int:
@@ -142,7 +142,8 @@ class CellPart(Part):
         cells = point._forward_solved(np.stack([own.reshape(len(own), -1) for own in along], axis=1))
         planes = np.arange(len(point.levels))
         whiten = self.state.whiten
-        own_levels = PlaneColumns(self._image(point.value * point.root), planes, np.eye(len(planes)), whiten)
+        design = point.problem.level_design
+        own_levels = PlaneColumns(self._image(point.value * point.root), planes, design, whiten)
         both = ([1, 2], [1, 2])
         cross = columns.against(own_levels) - np.tensordot(cells, levels.cells, axes=both)
         within = np.linalg.solve(point.information(levels, levels), cross.T)
@@ -266,7 +267,8 @@ def unseen_too(prepared: Prepared, point: Point, cells: CellData) -> Point:
 def together(prepared: Prepared) -> CellData:
     """The part searched and the part held out, which is over a mean of its own, in the same units."""
     cells, unseen = prepared.cells, prepared.unseen
-    ratio = unseen.geometry.level_e / cells.geometry.level_e
+    level = cells.geometry.level_e
+    ratio = np.divide(unseen.geometry.level_e, level, out=np.ones_like(level), where=level > 0.0)
     ratio = np.where(np.isfinite(ratio), ratio, 1.0)[:, np.newaxis, np.newaxis]
     there = unseen.weight > 0.0
     return replace(

@@ -27,6 +27,7 @@ from ...next_measurement import (
 )
 from ..cells import CellData
 from ..next_frames import pair_of
+from ..next_step import more_pixels
 
 MOST_CELLS = 4096  # Cells for which a forecast is made; of more, so many stand for all
 MARGIN_UM = 0.1  # Thickness beyond that of the cells which tables of further flats cover [µm]
@@ -67,7 +68,15 @@ class FlatForecast:
                 pairs.append(PairForecast(name, other, now[0], then[0], now[1], then[1]))
             pairs.sort(key=lambda pair: pair.separation_after)
             found.append(RankedMeasurement(measurement, tuple(pairs)))
+        found.sort(key=lambda item: -item.separation)
+        if self._few and found:
+            found.append(more_pixels(found[0], self.cells))
         return tuple(sorted(found, key=lambda item: -item.separation))
+
+    @property
+    def _few(self) -> bool:
+        """Whether the pixels are so few that the levels are known up to a common factor."""
+        return self.best.point.problem.level_shapes is not None
 
     def _further(
         self, name: str, rivals: Mapping[str, Hypothesis], here: Seen
@@ -110,6 +119,8 @@ class FlatForecast:
             dark_time_s=times,
         )
         reach = max(float(thickness.min()) - MARGIN_UM, 0.05), float(thickness.max()) + MARGIN_UM
+        if self._few:
+            reach = forward.range_um  # levels are those of the same thicknesses
         model = series.conditions(self.model)
         return Forward(model, forward.catalogue, geometry, forward.shape, reach)
 
@@ -170,10 +181,8 @@ class FlatForecast:
         problem = replace(problem, data=data, thickness_um=at, thickness_sigma_um=sigma / np.sqrt(several))
         point = Point(problem, {}, np.ones(len(value)), at, value, slope)
         columns = point.bare_columns(point.whitened(asked))
-        planes = np.arange(len(value))
-        own = np.zeros((len(value), *value.shape))
-        own[planes, planes] = point.response
-        levels = point.bare_columns(own)
+        shapes = np.ones((len(value), 1)) if self._few else np.eye(len(value))
+        levels = point.bare_columns(shapes.T[:, :, np.newaxis] * point.response)
         across = point.information(levels, columns)
         within = np.linalg.solve(point.information(levels, levels), across)
         return np.asarray(point.information(columns, columns) - across.T @ within)

@@ -11,6 +11,11 @@ FEWEST = 60
 """Second differences from which a noise level is taken; with fewer the stated one is believed, as before."""
 
 
+def is_measured(seen: BoolArray) -> bool:
+    """Whether cells with data, ``(ny, nx)``, are enough to measure their noise."""
+    return min(seen.shape) >= 3 and int(_nine(seen[np.newaxis]).sum()) >= FEWEST
+
+
 def measured_noise(point: Point, shape: tuple[int, int, int]) -> tuple[FloatArray, float]:
     """Measured over stated standard deviation of the noise ``(W,)``, and the scatter of the response of the cells.
 
@@ -18,10 +23,10 @@ def measured_noise(point: Point, shape: tuple[int, int, int]) -> tuple[FloatArra
     what is smooth. What exceeds that along the response, beside a thickness that may be off by its error, is scatter
     of the response.
     """
-    seen = np.asarray((point.problem.data.weight > 0.0).all(axis=0))
-    good = _nine(seen.reshape(shape[1:])[np.newaxis])[0]
-    if min(shape[1:]) < 3 or good.sum() < FEWEST:
+    seen = np.asarray((point.problem.data.weight > 0.0).all(axis=0)).reshape(shape[1:])
+    if not is_measured(seen):
         return np.ones(shape[0]), point.problem.response_sigma
+    good = _nine(seen[np.newaxis])[0]
     # A thickness that is known has followed the noise by a part of its error.
     left = point.projected(point.first_residual).reshape(shape)
     share = _mean_of_nine(point.noise_share.reshape(shape))
@@ -37,12 +42,9 @@ def measured_noise(point: Point, shape: tuple[int, int, int]) -> tuple[FloatArra
 
 def neighbour_scatter(field: FloatArray, seen: BoolArray, stated: float) -> float:
     """Standard deviation of what neighbours of a field ``(ny, nx)`` do not share; the stated one if there are few."""
-    if min(field.shape) < 3:
+    if not is_measured(seen):
         return stated
-    good = _nine(seen[np.newaxis])[0]
-    if good.sum() < FEWEST:
-        return stated
-    return float(np.sqrt((_second(field[np.newaxis])[0, good] ** 2).mean()))
+    return float(np.sqrt((_second(field[np.newaxis])[0, _nine(seen[np.newaxis])[0]] ** 2).mean()))
 
 
 OVERLAP = 3.78

@@ -28,15 +28,20 @@ from ...inference import (
 )
 from ..cells import CellData, bin_cube, finest_useful_cell
 from ..continuation import continued
+from ..noise import STATED_UNCERTAINTY
 from ..outliers import spoiled_cells
+from ..preparation import are_few
 from ..start import robust_surface, starting_thickness
 from ..validation import BLOCKS_ACROSS, FEWEST_ROWS
 from .known_thickness import as_known, stated_sigma_um, with_error_of_map
-from .noise import measured_noise, neighbour_scatter
+from .noise import is_measured, measured_noise, neighbour_scatter
 from .rules import Rules
 
 MARGIN_UM = 0.8
 """Thickness beyond the first one that tables cover [µm]: effects may move it by some fringe orders."""
+
+OPEN_ORDERS = 6
+"""Fringe orders on both sides in which every fit of a few pixels is tried, as in the present search."""
 
 FIRST_ERROR_UM = 0.004  # Error of the first thickness [µm]: it is one of steps of 0.01
 SURFACE_CELLS = 8.0  # Distance of the knots of the surface whose slope limits the size of cells [cells]
@@ -62,6 +67,23 @@ class Prepared:
         """The unchanged model at its best."""
         return self.null.point
 
+    @property
+    def few(self) -> bool:
+        """Whether there are too few pixels to tell the levels of the flats from the fringes."""
+        return self.problem.level_shapes is not None
+
+    @property
+    def measured(self) -> bool:
+        """Whether the noise is that of the data, not as stated."""
+        return is_measured(self.cells.seen)
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """What is believed and not measured, for the verdict."""
+        noise = f"noise taken as stated plus {STATED_UNCERTAINTY:.0%}: too few cells to measure it"
+        levels = "flat levels taken as known up to a common factor"
+        return (() if self.measured else (noise,)) + ((levels,) if self.few else ())
+
 
 def prepare(
     cube: FringeCube,
@@ -77,7 +99,8 @@ def prepare(
     Cells are made larger while the thickness of one is not known well enough and fringes stay wider than a cell.
     ``exposures``: their light, flats by default; other light is of sensors whose thickness is known.
     """
-    held = _held_out(cube.shape[1:], rules.heldout_fraction, rng)
+    good = np.asarray((np.asarray(cube.mask) == 0).all(axis=0))
+    held = _held_out(good, rules.heldout_fraction, rng)
     size = finest_useful_cell(_masked(cube, held), most_cells=most_cells)
     prepared = _in_cells(cube, held, size, model, effects, rules, exposures)
     if prepared.problem.known:
@@ -131,12 +154,13 @@ def _in_parts(larger: Prepared, smaller: Prepared) -> tuple[FloatArray, CellShap
     return thickness, CellShape(gradient, hessian, size, own.area), inside
 
 
-def _held_out(shape: tuple[int, ...], fraction: float, rng: np.random.Generator) -> BoolArray:
-    """Pixels that no selection sees, in blocks."""
-    rows, columns = shape
-    side = min(BLOCKS_ACROSS, max(min(shape) // FEWEST_ROWS, 3))
+def _held_out(good: BoolArray, fraction: float, rng: np.random.Generator) -> BoolArray:
+    """Pixels that no selection sees, in blocks; none where the others, ``good`` ones, would not tell their noise."""
+    rows, columns = good.shape
+    side = min(BLOCKS_ACROSS, max(min(good.shape) // FEWEST_ROWS, 3))
     blocks = rng.permutation(side * side).reshape(side, side) < round(fraction * side * side)
-    return np.asarray(blocks[np.ix_(np.arange(rows) * side // rows, np.arange(columns) * side // columns)])
+    held = blocks[np.ix_(np.arange(rows) * side // rows, np.arange(columns) * side // columns)]
+    return np.asarray(held if is_measured(good & ~held) else np.zeros_like(held))
 
 
 def _masked(cube: FringeCube, out: BoolArray) -> FringeCube:
@@ -175,6 +199,9 @@ def _in_cells(
     point = with_free_contrast(problem.at({}, point.levels, about))
     point = in_best_orders(point) if problem.known else in_whole_orders(point, rules.class_width)
     factor = np.ones(cells.shape[0])
+    if not is_measured(cells.seen):
+        factor += STATED_UNCERTAINTY
+        cells = cells.scaled_noise(factor, cells.response_scatter)
     for _ in range(2):
         spoiled = spoiled_cells(_left(point, cells), cells.weight > 0.0)
         cells, noise, problem = _judged(cells.restricted(~spoiled), point, rules)
@@ -315,10 +342,13 @@ def _problem(
     thickness_um: FloatArray,
     exposures: Exposures | None,
 ) -> Problem:
-    """Problem about a first thickness ``(ny, nx)``."""
+    """Problem about a first thickness ``(ny, nx)``; of a few pixels levels and fringe order are hardly told by data."""
     error = FIRST_ERROR_UM if cells.thickness_um is None else float(np.median(stated_sigma_um(cells)))
     shape = CellShape.of_field(thickness_um, cells.cell_px, error)
-    limits = (max(float(thickness_um.min()) - MARGIN_UM, 0.05), float(thickness_um.max()) + MARGIN_UM)
+    few = are_few(cells.shape[1:], int(cells.seen.sum()))
+    orders = OPEN_ORDERS if few and cells.thickness_um is None else 0
+    margin = MARGIN_UM + orders * float(model.fringe_order_um(np.median(cells.wavelength_nm)))
+    limits = (max(float(thickness_um.min()) - margin, 0.05), float(thickness_um.max()) + margin)
     centroid = None
     if cells.centroid is not None:
         centroid = cells.cell_px * cells.centroid.reshape(2, cells.shape[0], -1)
@@ -327,7 +357,10 @@ def _problem(
     forward = Forward(
         model, effects, cells.geometry, shape, limits, centroid, exposures=exposures, place_weight=weight
     )
-    return Problem(_data(cells), forward, thickness_um.ravel(), FIRST_SCATTER)
+    shapes = np.ones((cells.shape[0], 1)) if few else None
+    return Problem(
+        _data(cells), forward, thickness_um.ravel(), FIRST_SCATTER, level_shapes=shapes, orders=orders
+    )
 
 
 def _thickness_error_um(point: Point) -> float:

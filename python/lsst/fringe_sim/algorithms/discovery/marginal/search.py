@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from ...inference import (
     Hypothesis,
     effect_columns,
     fit,
+    in_open_orders,
     in_whole_orders,
     joined,
     jumped,
@@ -203,7 +204,8 @@ class SetSearch:
     def _in_orders(self, size: int) -> list[Hypothesis]:
         """All sets of so many effects, the best of them in other fringe orders too where none leaves noise."""
         grown = self._of_size(size)
-        if not grown or self.null.point.problem.known or self.leaves_noise(grown[0]):
+        problem = self.null.point.problem
+        if not grown or problem.known or problem.orders or self.leaves_noise(grown[0]):
             return grown
         for found in grown[: self.rules.beam]:
             point, order_um = found.point, found.point.problem.forward.order_um
@@ -281,13 +283,15 @@ class SetSearch:
         if base.effects and not missing:
             worth = [group for group in worth if self._may_lead(base, group[0])]
         fewest = 0 if base.effects and not missing else self.rules.fewest_refits
+        if base is self.null and base.point.problem.orders and not self.leaves_noise(base):
+            worth, most = groups, len(groups)  # derivatives in a wrong order promise nothing
         number = max(fewest, min(len(worth), most or self.rules.refits))
         if missing:
             number = min(number, self.rules.fewest_refits)
         found: dict[str, Hypothesis] = {}
         self.pace.left = min(number, len(groups))
         for group in groups[:number]:
-            if self._may_lead(base, group[0]) or len(found) < fewest:
+            if self._may_lead(base, group[0]) or len(found) < fewest or worth is groups:
                 found[group[0].name] = self._added(base, group[0])
         if not found:
             return
@@ -350,10 +354,8 @@ class SetSearch:
         key = frozenset(base.effects)
         if key not in self._scores:
             point = led(base.point)
-            columns = point.level_columns
-            if base.items:
-                columns = joined(columns, effect_columns(point, base.items))
-            scorer = Scorer(point, columns, self.rules.sizes)
+            scorer = self._scorer(point, base)
+            elsewhere = [self._scorer(one, base) for one in in_open_orders(point)]
             found = []
             for name, items in self.catalogue.items.items():
                 if not self.catalogue.may_add(name, base.effects):
@@ -361,11 +363,43 @@ class SetSearch:
                 effect = self.catalogue.effects[name]
                 sought = effect.search.sought or effect.local
                 one = proposed(effect, items, base) if sought else scorer.score(name, items)
+                if not sought:
+                    one = self._best_order(one, elsewhere, name, items, base)
                 if one is not None:
                     found.append(one)
             self._scores[key] = sorted(found, key=lambda one: -one.gain)
             self._joint[key] = scorer.joint()
         return self._scores[key]
+
+    def _scorer(self, point: Point, base: Hypothesis) -> Scorer:
+        """Scores beside a set at a point."""
+        columns = point.level_columns
+        if base.items:
+            columns = joined(columns, effect_columns(point, base.items))
+        return Scorer(point, columns, self.rules.sizes)
+
+    def _best_order(
+        self,
+        here: Scored | None,
+        elsewhere: Sequence[Scorer],
+        name: str,
+        items: tuple[Coordinate, ...],
+        base: Hypothesis,
+    ) -> Scored | None:
+        """The score of an effect, or that in another fringe order that is open, if it promises more in spite of it."""
+        best = here
+        for scorer in elsewhere:
+            own = scorer.score(name, items)
+            if own is None:
+                continue
+            gain = own.gain - (scorer.point.cost - base.point.cost)
+            if best is None or gain > best.gain:
+                try:
+                    start = jumped(scorer.point, items, list(self._part(items, own.step, 1.0)))
+                except OutOfRangeError:  # no layer is thinner than nothing
+                    continue
+                best = replace(own, gain=gain, start=start)
+        return best
 
     def _added(self, base: Hypothesis, one: Scored) -> Hypothesis:
         """The set with one effect more."""
@@ -375,10 +409,10 @@ class SetSearch:
             return self.pool[frozenset(names)]
         items = self.catalogue.items[one.name]
         with self.pace.fit():
-            if one.start is not None:
-                found = self._fit(names, (*base.items, *items), one.start)
-            else:
-                found = self._fitted(base, one, names, items)
+            found = None if one.start is None else self._fit(names, (*base.items, *items), one.start)
+            if found is None or (base.point.problem.orders and not self._is_kept(base, found, one)):
+                known = [] if found is None else [found]
+                found = max([*known, self._fitted(base, one, names, items)], key=self.posterior)
         self._added_before.add(step)
         brings = found.log_evidence - base.log_evidence
         self._brought[one.name] = max(self._brought.get(one.name, 0.0), brings)
@@ -393,7 +427,7 @@ class SetSearch:
         parts = PARTS[:1] if len(items) == 1 else PARTS
         first = self._best_start(base, items, [self._part(items, one.step, part) for part in parts])
         found = self._fit(names, every, base.point if first is None else first)
-        kept = found.log_evidence - base.log_evidence >= self.rules.least_of_promise * one.gain
+        kept = self._is_kept(base, found, one)
         if len(items) > 1 or (kept and not items[0].repeat):
             return found
         (item,) = items
@@ -411,6 +445,10 @@ class SetSearch:
                 break
             found, tried = new, []
         return found
+
+    def _is_kept(self, base: Hypothesis, found: Hypothesis, one: Scored) -> bool:
+        """Whether a fit brings what derivatives promised, or little less."""
+        return found.log_evidence - base.log_evidence >= self.rules.least_of_promise * one.gain
 
     @staticmethod
     def _part(items: Sequence[Coordinate], step: FloatArray, part: float) -> FloatArray:

@@ -16,7 +16,7 @@ from .preparation import Prepared
 def rms_left(prepared: Prepared, found: Hypothesis) -> float:
     """Rms of data minus model of the part searched, corrected for the freedom of all that is fitted."""
     point = found.point
-    return prepared.cells.noise_rms * point.misfit(len(point.levels) + len(found.items))
+    return prepared.cells.noise_rms * point.misfit(point.problem.free_levels + len(found.items))
 
 
 def size_of(prepared: Prepared) -> dict[str, float]:
@@ -41,10 +41,8 @@ def _noise_and_misfit(prepared: Prepared) -> list[tuple[float, float, float]]:
     shared = float((along2 / (1.0 + length2 * scatter2)).sum())
     single = float((residual * left).sum() - along2.sum())
     of_shared = float((1.0 / length2).mean())
-    free = 1 if point.problem.known else 2  # of a cell: the response, and a thickness that is not known
-    freedom = float(np.count_nonzero(point.root) - free * response.shape[1] - len(point.levels))
     return [
-        (cells.noise_rms**2 - scatter2 - of_shared, single, max(freedom, 1.0)),
+        (cells.noise_rms**2 - scatter2 - of_shared, single, max(float(point.problem.freedom), 1.0)),
         (of_shared + scatter2, shared, float(response.shape[1])),
     ]
 

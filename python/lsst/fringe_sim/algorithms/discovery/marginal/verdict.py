@@ -65,15 +65,15 @@ class MarginalSearch:
         self.prepared, self.model, self.rules, self.report = prepared, model, rules, report
         self.options, self.rng, self.until = options, rng, math.inf
         # On the sky the errors of the tables are those of the map too.
-        self.teaches = exposures is None
+        self.teaches = exposures is None and not prepared.few
         stack = model.system.stack
         medium = stack.layers[stack.position(model.system.varying)].medium
         wavelength = prepared.cells.wavelength_nm
         self.index = np.real(medium.index(wavelength, model.system.temperature_k))
-        self.notes = [*headers_apart(cube, model), "searched by one likelihood (core marginal)"]
+        self.notes = [*headers_apart(cube, model), "searched by one likelihood (core marginal)", *prepared.told]
         self._judged_with: list[set[str]] = []
         self._judged: dict[tuple[Hypothesis, Hypothesis], tuple[Channel, ...]] = {}
-        self.catalogue = Catalogue.of(effects, prepared.problem.forward, rules.most_effects)
+        self.catalogue = Catalogue.of(effects, prepared.problem, rules.most_effects)
         self.sets = SetSearch(self.catalogue, prepared.null, rules, report, self._leaves_noise)
 
     def _leaves_noise(self, found: Hypothesis) -> bool:
@@ -141,6 +141,8 @@ class MarginalSearch:
 
     def _judged_again(self, best: Hypothesis) -> Hypothesis:
         """The best set once noise and slopes in the cells are those that it leaves itself."""
+        if not self.prepared.measured:
+            return best
         for _ in range(self.rules.most_judged if len(best.effects) == 1 else 1):
             if not best.effects or set(best.effects) in self._judged_with or self._is_judged_with_alike(best):
                 break
@@ -174,9 +176,8 @@ class MarginalSearch:
                 chance = chance_text(worst.probability)
                 reasons.append(f"with {names} a residual remains in '{worst.name}' (chance {chance})")
         reasons += [*self._at_ends(best), *naming.doubts]
-        if unseen is not None:
-            self.notes.append(unseen.text)
-            reasons += [why] if (why := unseen.why_not(self.rules.outsider_prior)) else []
+        self.notes.append(unseen.text)
+        reasons += [why] if (why := unseen.why_not(self.rules.outsider_prior)) else []
         if reasons:
             return self._unexplained(best, reasons, naming.effects, unseen)
         form = self._what_may_be_form(best)
@@ -298,7 +299,7 @@ class MarginalSearch:
         ended = math.isinf(self.until) and not partial
         within = ended and accuracy.get("chance", 0.0) > self.rules.significance
         # What fails on data held out is like nothing.
-        fails = unseen is not None and unseen.gain <= 0.0
+        fails = unseen is not None and unseen.gain is not None and unseen.gain <= 0.0
         alike = self.prepared.null if within or fails else self._alike(found)
         state = state_of(found.point, found.point.level_columns)
         cells = self.prepared.cells
