@@ -169,7 +169,7 @@ class MarginalSearch:
         unseen = judge_unseen(self.prepared, best)
         explained, after = self._left_in_all_data(best)
         naming = name_effects(self.sets, best, explained, total_chance(after))
-        reasons = []
+        reasons: list[str] = []
         for channels in (self._channels(best), after):
             if not reasons and total_chance(channels) < self.rules.significance:
                 worst, names = min(channels, key=lambda one: one.probability), ", ".join(best.effects)
