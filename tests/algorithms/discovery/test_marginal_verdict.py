@@ -114,7 +114,7 @@ def test_what_a_set_leaves_and_takes_off_is_judged_in_all_data(rng: np.random.Ge
 
 @pytest.mark.rng("points in all data")
 def test_the_part_held_out_sees_what_the_rest_sees(rng: np.random.Generator) -> None:
-    """Pixels of these flats see a point: taken for areas, all data would have an offset of 4 sigma more than a part."""
+    """Pixels of these flats see a point: taken for areas, all data would have another offset."""
     prepared = prepared_of(cube_of(rng, flats_of({"wavelength_offset.offset": 1.5})), "wavelength_offset")
     assert not prepared.problem.forward.shape.area
     found = fitted(prepared, "wavelength_offset", offset=1.5)
