@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 
 from ....array_types import BoolArray, FloatArray
 from ....effects import ImageGeometry
-from ...inference import CellShape, Data, Hypothesis, Point, Problem, fit, in_best_orders, relaxed
+from ...inference import Data, Hypothesis, Point, Problem, fit, in_best_orders, relaxed
 from ..cells import CellData
 from ..channels import State
 from ..continuation import continued
@@ -19,8 +19,7 @@ from ..fit import Columns, PlaneColumns, Projected, Whitener
 from ..learned_columns import with_learned
 from ..learning import Part, judging_cells
 from ..outliers import spoiled_cells
-from .noise import neighbour_scatter
-from .preparation import Prepared
+from .preparation import Prepared, in_shape
 
 
 def with_corrections(point: Point) -> Point:
@@ -40,11 +39,8 @@ def in_all_cells(point: Point, cells: CellData) -> Point:
 
     ``cells``: those searched and those held out.
     """
-    field = continued(point.thickness_um.reshape(cells.shape[1:]), cells.seen)
-    known = float(np.median(point.thickness_sigma_um[cells.seen.ravel()]))
-    error, forward = max(known, neighbour_scatter(field, cells.seen, 0.0)), point.problem.forward
-    shape = CellShape.of_field(field, cells.cell_px, error, area=forward.shape.area)
-    problem = replace(point.problem, forward=replace(forward, shape=shape))
+    _, shape = in_shape(point, cells)
+    problem = replace(point.problem, forward=replace(point.problem.forward, shape=shape))
     return problem.at(point.settings, point.levels, point.thickness_um)
 
 
