@@ -51,7 +51,7 @@ class SetSearch:
         self._joint: dict[frozenset[str], Joint] = {}
         self._added_before: set[tuple[frozenset[str], str]] = set()
         self._short: set[tuple[frozenset[str], str]] = set()  # fits that came far behind before
-        self._brought: dict[str, float] = {}  # most log evidence that an effect brought where it was fitted
+        self._brought: dict[str, float] = {}  # largest part of its promise that an effect brought where it was fitted
         self._exchanged: set[frozenset[str]] = set()  # sets whose members were left out and exchanged
 
     def posterior(self, found: Hypothesis) -> float:
@@ -171,8 +171,9 @@ class SetSearch:
         return self._of_size(size)[: self.rules.beam]
 
     def hoped(self, one: Scored) -> float:
-        """What an effect may bring: all that it promises and little more, but no more than where it was fitted."""
-        return min(max(one.gain, 0.0) / self.rules.least_of_promise, self._brought.get(one.name, math.inf))
+        """What an effect may bring: all that it promises and little more, but no larger part than where it was fitted."""
+        most = 1.0 / self.rules.least_of_promise
+        return max(one.gain, 0.0) * min(most, self._brought.get(one.name, most))
 
     def _is_beaten(self, best: Hypothesis) -> bool:
         """Whether a set of one effect more is surely better."""
@@ -415,7 +416,8 @@ class SetSearch:
                 found = max([*known, self._fitted(base, one, names, items)], key=self.posterior)
         self._added_before.add(step)
         brings = found.log_evidence - base.log_evidence
-        self._brought[one.name] = max(self._brought.get(one.name, 0.0), brings)
+        if one.gain > 0.0:
+            self._brought[one.name] = max(self._brought.get(one.name, 0.0), brings / one.gain)
         self.say(f"  {'+'.join(names)}: promised {one.gain:.1f}, brings {brings:.1f}{self.pace.text}")
         return self._keep(found)
 
