@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -51,7 +50,9 @@ class SetSearch:
         self._joint: dict[frozenset[str], Joint] = {}
         self._added_before: set[tuple[frozenset[str], str]] = set()
         self._short: set[tuple[frozenset[str], str]] = set()  # fits that came far behind before
-        self._brought: dict[str, float] = {}  # largest part of its promise that an effect brought where it was fitted
+        self._brought: dict[
+            str, float
+        ] = {}  # largest part of its promise that an effect brought where it was fitted
         self._exchanged: set[frozenset[str]] = set()  # sets whose members were left out and exchanged
 
     def posterior(self, found: Hypothesis) -> float:
@@ -107,7 +108,9 @@ class SetSearch:
             ]
             smaller = max([smaller, *map(self._keep, others)], key=self.posterior)
             if len(smaller.effects) > 1 and not self._is_surely_better(larger, smaller):
-                smaller = self._settled(smaller)  # it may be what is left of a larger one, its twins not fitted
+                smaller = self._settled(
+                    smaller
+                )  # it may be what is left of a larger one, its twins not fitted
         return larger if self._is_surely_better(larger, smaller) else smaller
 
     def _from_thickness(self, found: Hypothesis, other: Hypothesis) -> Hypothesis:
@@ -171,7 +174,7 @@ class SetSearch:
         return self._of_size(size)[: self.rules.beam]
 
     def hoped(self, one: Scored) -> float:
-        """What an effect may bring: all that it promises and little more, but no larger part than where it was fitted."""
+        """What an effect may bring: all that it promises and little more, no larger part than where it was fitted."""
         most = 1.0 / self.rules.least_of_promise
         return max(one.gain, 0.0) * min(most, self._brought.get(one.name, most))
 
