@@ -189,7 +189,8 @@ def _in_cells(
     if stated is None:
         first = continued(starting_thickness(model, cells), cells.seen)
     else:  # cells that are held out lie where the map has them
-        first = np.where(np.isfinite(stated), stated, continued(stated, np.isfinite(stated)))
+        mapped = np.isfinite(stated)
+        first = stated if mapped.all() else np.where(mapped, stated, continued(stated, mapped))
     problem = as_known(_problem(cells, model, effects, first, exposures), cells)
     # The first thickness does not believe in the contrast of the model; it stays until that of the data is known.
     known = replace(problem, thickness_sigma_um=KNOWN_UM)
