@@ -45,7 +45,9 @@ def search_of(rng: np.random.Generator, hidden: dict[str, float]) -> SetSearch:
     value = value + NOISE * rng.standard_normal(value.shape)
     problem = Problem(Data(value, np.full(value.shape, NOISE**-2.0)), forward, thickness.ravel(), 1e-5)
     null = fit((), (), relaxed(problem.at({}, np.ones(8), thickness.ravel()), rounds=6))
-    return SetSearch(Catalogue.of(effects, null.point.problem), null, Rules(), lambda text: None, lambda found: True)
+    return SetSearch(
+        Catalogue.of(effects, null.point.problem), null, Rules(), lambda text: None, lambda found: True
+    )
 
 
 def fitted(search: SetSearch, *names: str) -> Hypothesis:

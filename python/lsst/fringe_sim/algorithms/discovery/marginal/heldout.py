@@ -89,9 +89,9 @@ def rms_unseen(prepared: Prepared) -> float | None:
 def judge_unseen(prepared: Prepared, found: Hypothesis) -> Unseen:
     """Compare a set with the unchanged model on the part held out, and on wavelengths that are left out."""
     if not prepared.unseen.seen.any():
-        gain = _gain_of_single_waves if prepared.few else _gain_of_waves
-        rms = (rms_left(prepared, one) for one in (prepared.null, found))
-        return Unseen(None, *rms, waves_gain=gain(prepared, found))
+        judged = _gain_of_single_waves if prepared.few else _gain_of_waves
+        before_rms, after_rms = (rms_left(prepared, one) for one in (prepared.null, found))
+        return Unseen(None, before_rms, after_rms, waves_gain=judged(prepared, found))
     noise, cells = prepared.unseen.noise_rms, together(prepared)
     whole = _whole(prepared, found.point)
     shape = whole.problem.forward.shape  # all are judged with cells as the best thickness shapes them

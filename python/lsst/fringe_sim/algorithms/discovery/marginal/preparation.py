@@ -70,7 +70,7 @@ class Prepared:
     @property
     def few(self) -> bool:
         """Whether there are too few pixels to tell the levels of the flats from the fringes."""
-        return self.problem.level_shapes is not None
+        return self.problem.levels_known
 
     @property
     def measured(self) -> bool:
@@ -342,7 +342,7 @@ def _problem(
     thickness_um: FloatArray,
     exposures: Exposures | None,
 ) -> Problem:
-    """Problem about a first thickness ``(ny, nx)``; of a few pixels levels and fringe order are hardly told by data."""
+    """Problem about a first thickness ``(ny, nx)``; a few pixels hardly tell levels and fringe order."""
     error = FIRST_ERROR_UM if cells.thickness_um is None else float(np.median(stated_sigma_um(cells)))
     shape = CellShape.of_field(thickness_um, cells.cell_px, error)
     few = are_few(cells.shape[1:], int(cells.seen.sum()))

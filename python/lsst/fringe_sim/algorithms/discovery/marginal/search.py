@@ -279,7 +279,7 @@ class SetSearch:
         if base.effects and not missing:
             worth = [group for group in worth if self._may_lead(base, group[0])]
         fewest = 0 if base.effects and not missing else self.rules.fewest_refits
-        if base is self.null and base.point.problem.orders and not self.leaves_noise(base):
+        if base is self.null and base.point.problem.levels_known and not self.leaves_noise(base):
             worth, most = groups, len(groups)  # derivatives in a wrong order promise nothing
         number = max(fewest, min(len(worth), most or self.rules.refits))
         if missing:
@@ -369,7 +369,7 @@ class SetSearch:
         items: tuple[Coordinate, ...],
         base: Hypothesis,
     ) -> Scored | None:
-        """The score of an effect, or that in another fringe order that is open, if it promises more in spite of it."""
+        """The score of an effect, or that in another fringe order, if it promises more in spite of that."""
         best = here
         for scorer in elsewhere:
             own = scorer.score(name, items)
@@ -393,7 +393,7 @@ class SetSearch:
         items = self.catalogue.items[one.name]
         with self.pace.fit():
             found = None if one.start is None else self._fit(names, (*base.items, *items), one.start)
-            if found is None or (base.point.problem.orders and not self._is_kept(base, found, one)):
+            if found is None or (base.point.problem.levels_known and not self._is_kept(base, found, one)):
                 known = [] if found is None else [found]
                 found = max([*known, self._fitted(base, one, names, items)], key=self.posterior)
         self._added_before.add(step)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
-
 from ...inference import Hypothesis
 from ..validation import size_beyond
 from ..verdict import Step

@@ -70,7 +70,11 @@ class MarginalSearch:
         medium = stack.layers[stack.position(model.system.varying)].medium
         wavelength = prepared.cells.wavelength_nm
         self.index = np.real(medium.index(wavelength, model.system.temperature_k))
-        self.notes = [*headers_apart(cube, model), "searched by one likelihood (core marginal)", *prepared.told]
+        self.notes = [
+            *headers_apart(cube, model),
+            "searched by one likelihood (core marginal)",
+            *prepared.told,
+        ]
         self._judged_with: list[set[str]] = []
         self._judged: dict[tuple[Hypothesis, Hypothesis], tuple[Channel, ...]] = {}
         self.catalogue = Catalogue.of(effects, prepared.problem, rules.most_effects)
