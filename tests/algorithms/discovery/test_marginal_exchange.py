@@ -12,7 +12,7 @@ from lsst.fringe_sim.algorithms.discovery.marginal.catalogue import Catalogue
 from lsst.fringe_sim.algorithms.discovery.marginal.critics import is_out_of_reach
 from lsst.fringe_sim.algorithms.discovery.marginal.naming import name_effects
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
-from lsst.fringe_sim.algorithms.discovery.marginal.scores import Scorer, best_gain
+from lsst.fringe_sim.algorithms.discovery.marginal.scores import Scored, Scorer, best_gain
 from lsst.fringe_sim.algorithms.discovery.marginal.search import SetSearch
 from lsst.fringe_sim.algorithms.inference import (
     CellShape,
@@ -101,13 +101,49 @@ def test_two_effects_do_not_take_the_place_of_the_right_one(rng: np.random.Gener
 
 
 @pytest.mark.rng("what is hoped for")
-def test_an_effect_is_hoped_to_bring_no_more_than_it_has_brought(rng: np.random.Generator) -> None:
+def test_an_effect_is_hoped_to_bring_the_part_of_its_promise_that_it_has_brought(rng: np.random.Generator) -> None:
     search = search_of(rng, {"wavelength_offset.offset": 0.6})
     scored = {one.name: one for one in search.scores(search.null)}
     before = search.hoped(scored["bandwidth"])
     assert before == pytest.approx(max(scored["bandwidth"].gain, 0.0) / Rules().least_of_promise)
     brings = search._added(search.null, scored["bandwidth"]).log_evidence - search.null.log_evidence
-    assert search.hoped(replace(scored["bandwidth"], gain=1e6)) == pytest.approx(max(brings, 0.0))
+    part = min(max(brings, 0.0) / scored["bandwidth"].gain, 1.0 / Rules().least_of_promise)
+    # Beside another effect it may promise more, and bring more.
+    assert search.hoped(replace(scored["bandwidth"], gain=1e6)) == pytest.approx(1e6 * part)
+
+
+@pytest.mark.rng("twins of an effect that is misled")
+@pytest.mark.parametrize(
+    ("twins", "brings", "fitted"),
+    [((785.0,), (), 0), ((788.0,), (700.0,), 1), ((890.0, 880.0), (700.0, 880.0), 2),
+     ((890.0, 700.0), (880.0, 690.0), 1), ((890.0, 860.0), (889.0, 870.0), 2)],
+    ids=str,
+)  # fmt: skip
+def test_twins_of_an_effect_that_brings_less_than_it_promised_are_fitted_as_far_as_they_may_win(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch,
+    twins: tuple[float, ...], brings: tuple[float, ...], fitted: int,
+) -> None:  # fmt: skip
+    """The first of them promises 900 and brings 700, and an effect of another kind brings 790 of its 800."""
+    search, (first, *others, last) = search_of(rng, {}), FEW
+    alike, apart = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    own = dict(zip(others, twins, strict=False))
+    promised = {first: 900.0, **own, last: 800.0}
+    scored = [
+        Scored(name, gain, 1, np.ones(1), apart if name == last else alike) for name, gain in promised.items()
+    ]
+    brought = {first: 700.0, **dict(zip(others, brings, strict=False)), last: 790.0}
+    tried = []
+
+    def fitted_from(base: Hypothesis, one: Scored, names: tuple[str, ...], items: object) -> Hypothesis:
+        tried.append(one.name)
+        return replace(base, effects=names, log_evidence=base.log_evidence + brought[one.name])
+
+    monkeypatch.setattr(search, "scores", lambda base: sorted(scored, key=lambda one: -one.gain))
+    monkeypatch.setattr(search, "_fitted", fitted_from)
+    search._grow(search.null)
+    assert tried == [first, last, *others[:fitted]]
+    best = search.best_of(1)[0]
+    assert best.effects == (max(tried, key=brought.__getitem__),)
 
 
 @pytest.mark.rng("orders of a set")

@@ -158,7 +158,7 @@ def test_cells_at_a_rim_in_another_order_do_not_steepen_it(per_cell: float) -> N
     wrong = field.copy()
     wrong[9:12, 8] += order_um
     wrong[10, 9] += order_um
-    found = preparation._in_order_of_neighbours(wrong, seen, order_um, Rules().order_side)
+    found = preparation._in_order_of_neighbours(wrong, seen, order_um, preparation.ORDER_SIDE)
     np.testing.assert_allclose(found[seen], field[seen], atol=1e-9)
 
 
@@ -168,5 +168,5 @@ def test_half_an_order_on_an_island_is_kept() -> None:
     y, x = np.mgrid[:16, :16]
     field = 15.0 + 0.4 * order_um * (np.hypot(y - 8, x - 8) < 3)
     everywhere = np.ones(field.shape, dtype=bool)
-    found = preparation._in_order_of_neighbours(field, everywhere, order_um, Rules().order_side)
+    found = preparation._in_order_of_neighbours(field, everywhere, order_um, preparation.ORDER_SIDE)
     np.testing.assert_array_equal(found, field)

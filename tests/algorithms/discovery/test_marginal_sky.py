@@ -69,6 +69,29 @@ def test_every_cell_sees_the_light_at_its_own_place(monkeypatch: pytest.MonkeyPa
         assert np.ptp(off) > 0.1 * fringes.std()  # it matters
 
 
+def test_an_effect_of_the_sky_is_compared_with_the_sensor_and_not_with_its_voids() -> None:
+    """Light that is kept: of voids of two depths after each other, and of a sky that changes after that."""
+    base, grid = FringeModel.from_setup("monocam"), (13.0, 0.01, 40)
+    brighter = FringeModel.from_setup("monocam", {"sky_continuum.scale": 1.0 + 1e-6})
+    shallow, deep = (
+        inside
+        for size_nm in (60.0, 120.0)
+        for _, inside in FringeModel.from_setup("monocam", {"void.thickness": size_nm}).islands
+    )
+
+    def light_of() -> SkyExposures:
+        return SkyExposures(base, bright_sky(2), bandpass_of(base), ({},))
+
+    light, other = light_of(), light_of()
+    on_deep, unchanged = other.response(deep, *grid), light_of().response(base, *grid)
+    on_shallow = light.response(shallow, *grid)
+    np.testing.assert_array_equal(light.response(deep, *grid), on_deep)
+    np.testing.assert_allclose(light.response(brighter, *grid), unchanged, rtol=1e-6)
+    fringes = np.ptp(unchanged)
+    assert np.abs(on_shallow - unchanged).max() > 0.3 * fringes
+    assert np.abs(on_deep - on_shallow).max() > 0.3 * fringes
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",

@@ -8,6 +8,7 @@ import pytest
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover, search
 from lsst.fringe_sim.algorithms.discovery.marginal.accuracy import evidence_within, told_accuracy
 from lsst.fringe_sim.algorithms.discovery.marginal.heldout import Unseen, judge_unseen
+from lsst.fringe_sim.algorithms.discovery.marginal.lesson import in_all_data
 from lsst.fringe_sim.algorithms.discovery.marginal.pace import Pace
 from lsst.fringe_sim.algorithms.discovery.marginal.preparation import Prepared, prepare
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
@@ -89,6 +90,37 @@ def test_selection_does_not_see_an_effect_in_the_part_held_out(rng: np.random.Ge
     assert outside.verdict == "unexplained"
     assert "data held out are not predicted better" in outside.unexplained["reason"]
     assert outside.unexplained["like"] == []
+
+
+@pytest.mark.rng("what all data show")
+def test_what_a_set_leaves_and_takes_off_is_judged_in_all_data(rng: np.random.Generator) -> None:
+    """The part held out has the χ² of the rest; with waves in it alone a set has no name."""
+    cube = cube_of(rng, flats_of({"contrast_loss.factor": 0.9}))
+    prepared = prepared_of(cube, "contrast_loss")
+    found = fitted(prepared, "contrast_loss", factor=0.9)
+    null, whole = in_all_data(prepared, found)
+    taken, held = prepared.null.chi2 - found.chi2, prepared.unseen.seen.ravel()
+    assert null.chi2 - whole.chi2 > 1.15 * taken
+    energy = whole.point.cell_energy
+    assert energy[held].mean() == pytest.approx(energy[~held].mean(), rel=0.1)
+    assert whole.values == pytest.approx(found.values, abs=3.0 * np.sqrt(found.covariance[0, 0]))
+    wave = np.cos(0.7 * SIDE * X) * np.linspace(-0.02, 0.02, len(WAVELENGTHS))[:, np.newaxis, np.newaxis]
+    planted = replace(cube, image=(cube.image * (1.0 + wave * prepared.unseen.seen)).astype(np.float32))
+    verdict = verdict_of(planted, "contrast_loss")
+    assert verdict.verdict == "unexplained"
+    assert "with contrast_loss a residual remains" in verdict.unexplained["reason"]
+    assert verdict_of(cube, "contrast_loss").verdict == "named"
+
+
+@pytest.mark.rng("points in all data")
+def test_the_part_held_out_sees_what_the_rest_sees(rng: np.random.Generator) -> None:
+    """Pixels of these flats see a point: taken for areas, all data would have another offset."""
+    prepared = prepared_of(cube_of(rng, flats_of({"wavelength_offset.offset": 1.5})), "wavelength_offset")
+    assert not prepared.problem.forward.shape.area
+    found = fitted(prepared, "wavelength_offset", offset=1.5)
+    _, whole = in_all_data(prepared, found)
+    assert not whole.point.problem.forward.shape.area
+    assert whole.values == pytest.approx([1.5], abs=3.0 * np.sqrt(whole.covariance[0, 0]))
 
 
 @pytest.fixture(scope="module")

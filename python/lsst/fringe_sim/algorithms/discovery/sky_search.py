@@ -218,11 +218,13 @@ class SkyExposures:
             for item in model.effects
             if item.effect.acts_on not in ("spectrum", "response", "image")
         )
-        key = (*key, model.base_system.beam.theta.tobytes())
-        if key not in self._reduced:
-            while len(self._reduced) >= _KEPT:
-                self._reduced.pop(next(iter(self._reduced)))
-            self._reduced[key] = self._reduce(model)
+        # The model of an island has no effect for it; its layers are in the stack before all effects.
+        beam = model.base_system.beam
+        before = replace(model.base_system, beam=self.base.base_system.beam)
+        key = (*key, before, beam.theta.tobytes(), beam.weight.tobytes())
+        self._reduced[key] = self._reduced.pop(key) if key in self._reduced else self._reduce(model)
+        while len(self._reduced) > _KEPT:
+            self._reduced.pop(next(iter(self._reduced)))
         return self._reduced[key]
 
     def _reduce(self, model: FringeModel) -> dict[str, _Reduced]:

@@ -4,7 +4,7 @@ from .cell_average import CellShape
 from .common_offset import led, with_common_offset
 from .coordinates import Coordinate, coordinates_of
 from .forward import Forward
-from .marginal import Columns, Data, Point, Problem, joined, kept
+from .marginal import Columns, Data, Point, Problem, joined, kept, solved
 from .optimise import (
     Hypothesis,
     effect_columns,
@@ -37,6 +37,7 @@ __all__ = [
     "kept",
     "led",
     "relaxed",
+    "solved",
     "with_common_offset",
     "with_free_contrast",
 ]

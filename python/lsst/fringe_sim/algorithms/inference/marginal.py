@@ -429,6 +429,17 @@ class Point:
         return self.problem.at(self.settings if settings is None else settings, levels, thickness_um)
 
 
+def solved(information: FloatArray, right: FloatArray) -> FloatArray:
+    """Solution ``(K, ...)`` of a Fisher matrix ``(K, K)``; parameters along which nothing changes stay.
+
+    The place of an island that lies where there are no data is one.
+    """
+    scale = np.sqrt(np.diag(information))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)
+    return np.asarray((inverse / np.outer(scale, scale)) @ right)
+
+
 def joined(first: Columns, second: Columns) -> Columns:
     """Columns of two groups of parameters; those of single exposures are in the first."""
     return Columns(

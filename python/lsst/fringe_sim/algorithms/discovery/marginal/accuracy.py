@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ....array_types import FloatArray
-from ...inference import Columns, Hypothesis, Point, effect_columns, joined
+from ...inference import Columns, Hypothesis, Point, effect_columns, joined, solved
 from ..accuracy import ACCURACY_SOURCE, MODEL_ACCURACY, TABLE_STEP_NM
 from ..learned_columns import over_wavelength
 from .critics import CRITICS, judge, total_chance
@@ -56,7 +56,7 @@ def evidence_within(found: Hypothesis, accuracy: float) -> float:
     if found.items:
         columns = joined(columns, effect_columns(point, found.items))
     block = model_block(point, accuracy)
-    across = np.linalg.solve(point.information(columns, columns), point.information(columns, block))
+    across = solved(point.information(columns, columns), point.information(columns, block))
     known = point.information(block, block) - point.information(block, columns) @ across
     score = point.unbiased_score(block) - across.T @ point.unbiased_score(columns)
     total = np.eye(len(score)) + 0.5 * (known + known.T)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ....array_types import FloatArray
 from ....effects import ImageGeometry
-from ...inference import Columns, Hypothesis, Point, effect_columns, joined
+from ...inference import Columns, Hypothesis, Point, effect_columns, joined, solved
 from ..channels import (
     BANDS,
     Channel,
@@ -67,7 +67,7 @@ class Judged:
         point = self.found.point
         own = point.bare_columns(values)
         base = point.information(self.columns, self.columns) + self.known
-        across = np.linalg.solve(base, point.information(self.columns, own))
+        across = solved(base, point.information(self.columns, own))
         matrix = point.information(own, own) - point.information(own, self.columns) @ across
         score = point.unbiased_score(own) - across.T @ point.unbiased_score(self.columns)
         scale = np.sqrt(np.maximum((values**2).sum(axis=(1, 2)), 1e-300))
@@ -84,7 +84,7 @@ def state_of(point: Point, columns: Columns, known: FloatArray | float = 0.0) ->
     """
     shape = (len(point.levels), *point.problem.forward.geometry.sample_shape)
     base = point.information(columns, columns) + known
-    step = np.asarray(np.linalg.solve(base, point.score(columns)), dtype=float)
+    step = solved(base, point.score(columns))
     left = point.projected(point.first_residual - columns.combined(step))
     left = left / np.sqrt(np.maximum(point.noise_share, 0.05))
     root = point.root.reshape(shape)

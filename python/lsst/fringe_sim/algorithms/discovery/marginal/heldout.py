@@ -56,6 +56,8 @@ class Unseen:
         if self.gain is not None and self.gain <= 0.0:
             return "data held out are not predicted better"
         gain = self.gain or 0.0
+        if self.gain is None and self.waves_gain == 0.0:
+            return "there are too few pixels and wavelengths to hold any out"
         if gain + self.waves_gain <= 0.0:
             return "wavelengths that are left out are not predicted better than by the unchanged model"
         ahead = self.stand_in_gain - gain
@@ -89,9 +91,9 @@ def rms_unseen(prepared: Prepared) -> float | None:
 def judge_unseen(prepared: Prepared, found: Hypothesis) -> Unseen:
     """Compare a set with the unchanged model on the part held out, and on wavelengths that are left out."""
     if not prepared.unseen.seen.any():
-        judged = _gain_of_single_waves if prepared.few else _gain_of_waves
-        before_rms, after_rms = (rms_left(prepared, one) for one in (prepared.null, found))
-        return Unseen(None, before_rms, after_rms, waves_gain=judged(prepared, found))
+        of_waves = _gain_of_single_waves if prepared.few else _gain_of_waves
+        before_rms, after_rms = rms_left(prepared, prepared.null), rms_left(prepared, found)
+        return Unseen(None, before_rms, after_rms, waves_gain=of_waves(prepared, found))
     noise, cells = prepared.unseen.noise_rms, together(prepared)
     whole = _whole(prepared, found.point)
     shape = whole.problem.forward.shape  # all are judged with cells as the best thickness shapes them

@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 
 from ....array_types import BoolArray, FloatArray
 from ....effects import ImageGeometry
-from ...inference import CellShape, Data, Hypothesis, Point, Problem, fit, in_best_orders, relaxed
+from ...inference import Data, Hypothesis, Point, Problem, fit, in_best_orders, relaxed
 from ..cells import CellData
 from ..channels import State
 from ..continuation import continued
@@ -19,8 +19,7 @@ from ..fit import Columns, PlaneColumns, Projected, Whitener
 from ..learned_columns import with_learned
 from ..learning import Part, judging_cells
 from ..outliers import spoiled_cells
-from .noise import neighbour_scatter
-from .preparation import Prepared
+from .preparation import Prepared, in_shape
 
 
 def with_corrections(point: Point) -> Point:
@@ -40,9 +39,7 @@ def in_all_cells(point: Point, cells: CellData) -> Point:
 
     ``cells``: those searched and those held out.
     """
-    field = continued(point.thickness_um.reshape(cells.shape[1:]), cells.seen)
-    known = float(np.median(point.thickness_sigma_um[cells.seen.ravel()]))
-    shape = CellShape.of_field(field, cells.cell_px, max(known, neighbour_scatter(field, cells.seen, 0.0)))
+    _, shape = in_shape(point, cells)
     problem = replace(point.problem, forward=replace(point.problem.forward, shape=shape))
     return problem.at(point.settings, point.levels, point.thickness_um)
 
@@ -186,6 +183,21 @@ class CellLesson:
         """Rms of the noise."""
         return self.cells.noise_rms
 
+    def in_all_data(self, unchanged: Point) -> tuple[Hypothesis, Hypothesis]:
+        """The unchanged model and the effects, fitted to all cells.
+
+        ``unchanged``: the model without the effects at the cells searched and those held out.
+        """
+        null = fit((), (), self.problem.at({}, unchanged.levels, unchanged.thickness_um))
+        own = self.start
+        found = fit(
+            self.found.effects,
+            self.found.items,
+            self.problem.at(own.settings, own.levels, own.thickness_um),
+            aim=null.point.cost,
+        )
+        return null, found
+
     def teaching(self) -> CellPart:
         """The cells that teach, with the effects fitted to them."""
         start = self._at(~self.judged, self.start, self.start.settings)
@@ -207,6 +219,12 @@ class CellLesson:
         """The data of some of the cells, near a point."""
         problem = replace(self.problem, data=data_of(self.cells.restricted(cells)))
         return problem.at(settings, point.levels, point.thickness_um)
+
+
+def in_all_data(prepared: Prepared, found: Hypothesis) -> tuple[Hypothesis, Hypothesis]:
+    """The unchanged model and a set that was fitted to the part searched, both fitted to all data after selection."""
+    lesson = CellLesson.of(prepared, found)
+    return lesson.in_all_data(unseen_too(prepared, with_corrections(prepared.point), together(prepared)))
 
 
 def _point_of(part: Part) -> Point:

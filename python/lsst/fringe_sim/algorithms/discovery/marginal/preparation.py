@@ -43,6 +43,10 @@ MARGIN_UM = 0.8
 OPEN_ORDERS = 6
 """Fringe orders on both sides in which every fit of a few pixels is tried, as in the present search."""
 
+ORDER_SIDE = 5
+"""Side of the part about a cell whose median tells its fringe order [cells]: at a corner of the data a quarter of it
+has any, of which four of nine may be in other orders; with the next smaller side it were one of four."""
+
 FIRST_ERROR_UM = 0.004  # Error of the first thickness [µm]: it is one of steps of 0.01
 SURFACE_CELLS = 8.0  # Distance of the knots of the surface whose slope limits the size of cells [cells]
 KNOWN_UM = 1e-6  # Error of a thickness that is known [µm]
@@ -271,15 +275,12 @@ def _judged(cells: CellData, point: Point, rules: Rules) -> tuple[CellData, Floa
     point = with_error_of_map(point.problem_with(_data(cells)), cells)
     noise, scatter = measured_noise(point, cells.shape)
     cells = cells.scaled_noise(noise, scatter)
-    old, thickness = point.problem.forward, _whole(point, cells, rules.order_side)
+    old, (thickness, shape) = point.problem.forward, in_shape(point, cells)
     # Levels tell how many electrons a mean of one is; they are known from the first fit on.
     geometry = old.geometry
     if geometry is cells.geometry:
         geometry = replace(geometry, level_e=geometry.level_e * point.levels)
-    # A wrong model errs in the thickness by more than noise does, and slopes that follow the errors blur fringes.
-    error = max(_thickness_error_um(point), neighbour_scatter(thickness, cells.seen, 0.0))
     # Tables stay; they reach farther than the thickness moves.
-    shape = CellShape.of_field(thickness, cells.cell_px, error, area=old.shape.area)
     forward = replace(old, shape=shape, geometry=geometry)
     problem = replace(
         point.problem.about(thickness.ravel()),
@@ -290,6 +291,15 @@ def _judged(cells: CellData, point: Point, rules: Rules) -> tuple[CellData, Floa
     return cells, noise, problem
 
 
+def in_shape(point: Point, cells: CellData) -> tuple[FloatArray, CellShape]:
+    """Thickness of all cells ``(ny, nx)``, in the orders of their neighbours, and what it does within them."""
+    thickness = _whole(point, cells)
+    # A wrong model errs in the thickness by more than noise does, and slopes that follow the errors blur fringes.
+    error = max(_thickness_error_um(point), neighbour_scatter(thickness, cells.seen, 0.0))
+    area = point.problem.forward.shape.area
+    return thickness, CellShape.of_field(thickness, cells.cell_px, error, area=area)
+
+
 def _left(point: Point, cells: CellData) -> FloatArray:
     """Data minus model."""
     return np.asarray(
@@ -297,14 +307,14 @@ def _left(point: Point, cells: CellData) -> FloatArray:
     )
 
 
-def _whole(point: Point, cells: CellData, side: int) -> FloatArray:
+def _whole(point: Point, cells: CellData) -> FloatArray:
     """Thickness of all cells, ``(ny, nx)``, in the orders of their neighbours.
 
     Where there are no data, it is continued from where there are.
     """
     field = point.thickness_um.reshape(cells.shape[1:])
     order_um = point.problem.forward.order_um
-    return continued(_in_order_of_neighbours(field, cells.seen, order_um, side), cells.seen)
+    return continued(_in_order_of_neighbours(field, cells.seen, order_um, ORDER_SIDE), cells.seen)
 
 
 def _in_order_of_neighbours(field: FloatArray, seen: BoolArray, order_um: float, side: int) -> FloatArray:

@@ -41,9 +41,6 @@ class Rules:
     # largest phase across a cell [rad] for which they are: three places describe it to 1e-3 of the fringes, which
     # are weak then
     cell_phase: float = 3.5
-    # side of the part about a cell whose median tells its fringe order [cells]: at a corner of the data a quarter of
-    # it has any, of which four of nine may be in other orders; with the next smaller side it were one of four
-    order_side: int = 5
     # part of what an effect brings that derivatives promise; sets that cannot come near the best are not fitted,
     # and an effect that brings less is tried from elsewhere. Seen in the fits of four cases of the panel, where all
     # but a few kept within it

@@ -11,7 +11,17 @@ import numpy as np
 from ....array_types import BoolArray, FloatArray
 from ....effects import Effect, Residuals
 from ....errors import OutOfRangeError
-from ...inference import Columns, Coordinate, Hypothesis, Point, effect_columns, in_best_orders, jumped, kept
+from ...inference import (
+    Columns,
+    Coordinate,
+    Hypothesis,
+    Point,
+    effect_columns,
+    in_best_orders,
+    jumped,
+    kept,
+    solved,
+)
 from ...inference.coordinates import SECANT
 from .pairs import FEW, Joint, Promised
 from .smooth import beside_smooth
@@ -69,12 +79,12 @@ class Scorer:
             own = effect_columns(self.point, items, secant)
         except OutOfRangeError:
             return None
-        across = np.linalg.solve(self.base, self.point.information(self.columns, own))
+        across = solved(self.base, self.point.information(self.columns, own))
         matrix = self.point.information(own, own) - self.point.information(own, self.columns) @ across
         gradient = self.point.score(own) - own.log_det - across.T @ self.gradient
         scale = np.array([item.scale for item in items])
         if len(items) <= FEW and secant == SECANT:
-            self.single.setdefault(name, Promised(items, own, np.asarray(across), gradient))
+            self.single.setdefault(name, Promised(items, own, across, gradient))
         best, step, degrees = -math.inf, np.zeros(len(items)), 0
         for highest in sorted({item.refinement for item in items}):
             few = np.array([item.refinement <= highest for item in items])

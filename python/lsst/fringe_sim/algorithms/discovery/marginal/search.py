@@ -51,7 +51,8 @@ class SetSearch:
         self._joint: dict[frozenset[str], Joint] = {}
         self._added_before: set[tuple[frozenset[str], str]] = set()
         self._short: set[tuple[frozenset[str], str]] = set()  # fits that came far behind before
-        self._brought: dict[str, float] = {}  # most log evidence that an effect brought where it was fitted
+        self._brought: dict[str, float] = {}  # largest part of its promise that an effect brought where it was fitted
+        self._exchanged: set[frozenset[str]] = set()  # sets whose members were left out and exchanged
 
     def posterior(self, found: Hypothesis) -> float:
         """Log evidence less the price of the effects."""
@@ -105,6 +106,8 @@ class SetSearch:
                 if self.catalogue.may_leave((name,), larger.effects)
             ]
             smaller = max([smaller, *map(self._keep, others)], key=self.posterior)
+            if len(smaller.effects) > 1 and not self._is_surely_better(larger, smaller):
+                smaller = self._settled(smaller)  # it may be what is left of a larger one, its twins not fitted
         return larger if self._is_surely_better(larger, smaller) else smaller
 
     def _from_thickness(self, found: Hypothesis, other: Hypothesis) -> Hypothesis:
@@ -135,6 +138,7 @@ class SetSearch:
         """The same search of a problem that was judged again; the best sets are fitted from where they are."""
         again = SetSearch(self.catalogue, null, self.rules, self.say, self.leaves_noise, pace=self.pace)
         again._brought.update(self._brought)
+        again._exchanged.update(self._exchanged)
         known = sorted(self.pool.values(), key=self.posterior, reverse=True)
         top = known[0].log_evidence - self.null.log_evidence
         # With one effect of several the noise is still that of a wrong model.
@@ -167,8 +171,9 @@ class SetSearch:
         return self._of_size(size)[: self.rules.beam]
 
     def hoped(self, one: Scored) -> float:
-        """What an effect may bring: all that it promises and little more, but no more than where it was fitted."""
-        return min(max(one.gain, 0.0) / self.rules.least_of_promise, self._brought.get(one.name, math.inf))
+        """What an effect may bring: all that it promises and little more, but no larger part than where it was fitted."""
+        most = 1.0 / self.rules.least_of_promise
+        return max(one.gain, 0.0) * min(most, self._brought.get(one.name, most))
 
     def _is_beaten(self, best: Hypothesis) -> bool:
         """Whether a set of one effect more is surely better."""
@@ -216,7 +221,8 @@ class SetSearch:
 
     def _settled(self, found: Hypothesis) -> Hypothesis:
         """The best set after members were left out and exchanged, as long as that helps."""
-        while True:
+        while frozenset(found.effects) not in self._exchanged:
+            self._exchanged.add(frozenset(found.effects))
             for name in found.effects:
                 if self.catalogue.may_leave((name,), found.effects):
                     self._grow(self.without(found, name), missing=name)
@@ -227,9 +233,8 @@ class SetSearch:
                 (one for one in self.pool.values() if len(one.effects) <= len(found.effects)),
                 key=self.posterior,
             )
-            if self.posterior(best) <= self.posterior(found) or len(best.effects) < len(found.effects):
-                return max(best, found, key=self.posterior)
-            found = best
+            found = max(best, found, key=self.posterior)
+        return found
 
     def without(self, found: Hypothesis, name: str) -> Hypothesis:
         """The set without one member, fitted from where it is, or the better one that is known."""
@@ -269,7 +274,7 @@ class SetSearch:
     # Growth -----------------------------------------------------------------------------------------------------
 
     def _grow(self, base: Hypothesis, missing: str = "", most: int | None = None) -> None:
-        """Refit the best of each group of twins beside a set, and all of the group that wins.
+        """Refit the best of each group of twins beside a set, and twins that may win.
 
         ``missing``: a member of a larger set that was taken out here; its twins are refitted in any case.
         """
@@ -291,16 +296,29 @@ class SetSearch:
                 found[group[0].name] = self._added(base, group[0])
         if not found:
             return
-        top = max(self.posterior(one) for one in found.values())
-        alike = {name for name, one in found.items() if self.posterior(one) > top - self.rules.class_width}
+        least = max(self.posterior(one) for one in found.values()) - self.rules.class_width
         for group in groups:
-            names = {one.name for one in group}
-            self.pace.left = len(group)
-            if alike & names or missing in names:
-                kept = self._kept(base, group)
-                for one in group:
-                    if one.name != missing and self._may_lead(base, one, kept):
-                        self._added(base, one)
+            first = found.get(group[0].name)
+            near = missing in {one.name for one in group} or (
+                first is not None and self.posterior(first) > least
+            )
+            if near or first is not None:
+                self._add_twins(base, [one for one in group if one.name != missing], least, near)
+
+    def _add_twins(self, base: Hypothesis, group: Sequence[Scored], least: float, near: bool) -> None:
+        """Refit the twins of an effect that came near the best, or did not bring what they promise.
+
+        An effect that derivatives mislead says nothing of its twins. They are refitted as far as they come near the
+        best if they bring what they promise, and as soon as one does, those that may bring a little more.
+        ``least``: posterior from which on a set is near the best.
+        """
+        self.pace.left = len(group)
+        kept = self._kept(base, group) if near else self.rules.least_of_promise
+        for one in group:
+            if not self._may_lead(base, one, kept):
+                continue
+            if self.posterior(self._added(base, one)) > least and not near:
+                near, kept = True, self._kept(base, group)
 
     def _kept(self, base: Hypothesis, group: Sequence[Scored]) -> float:
         """How many times what derivatives promise an effect of a group of twins has brought, 1 at least."""
@@ -398,7 +416,8 @@ class SetSearch:
                 found = max([*known, self._fitted(base, one, names, items)], key=self.posterior)
         self._added_before.add(step)
         brings = found.log_evidence - base.log_evidence
-        self._brought[one.name] = max(self._brought.get(one.name, 0.0), brings)
+        if one.gain > 0.0:
+            self._brought[one.name] = max(self._brought.get(one.name, 0.0), brings / one.gain)
         self.say(f"  {'+'.join(names)}: promised {one.gain:.1f}, brings {brings:.1f}{self.pace.text}")
         return self._keep(found)
 

@@ -29,7 +29,7 @@ from .accuracy import told_accuracy
 from .catalogue import Catalogue
 from .critics import is_out_of_reach, judge, state_of, total_chance
 from .heldout import Unseen, judge_unseen, rms_unseen
-from .lesson import CellLesson, CellPart, with_corrections
+from .lesson import CellLesson, CellPart, in_all_data, with_corrections
 from .naming import Naming, name_effects
 from .next_flats import FlatForecast
 from .next_frames import FrameForecast
@@ -169,16 +169,16 @@ class MarginalSearch:
     def _concluded(self, best: Hypothesis) -> Verdict:
         """Judgement of the set that was selected."""
         best = self.sets.alike(best)
-        after = self._channels(best)
         self.report(f"data held out are asked about {', '.join(best.effects)}")
         unseen = judge_unseen(self.prepared, best)
-        explained = self.prepared.null.chi2 - best.chi2
+        explained, after = self._left_in_all_data(best)
         naming = name_effects(self.sets, best, explained, total_chance(after))
-        reasons = []
-        if total_chance(after) < self.rules.significance:
-            worst, names = min(after, key=lambda channel: channel.probability), ", ".join(best.effects)
-            chance = chance_text(worst.probability)
-            reasons.append(f"with {names} a residual remains in '{worst.name}' (chance {chance})")
+        reasons: list[str] = []
+        for channels in (self._channels(best), after):
+            if not reasons and total_chance(channels) < self.rules.significance:
+                worst, names = min(channels, key=lambda one: one.probability), ", ".join(best.effects)
+                chance = chance_text(worst.probability)
+                reasons.append(f"with {names} a residual remains in '{worst.name}' (chance {chance})")
         reasons += [*self._at_ends(best), *naming.doubts]
         self.notes.append(unseen.text)
         reasons += [why] if (why := unseen.why_not(self.rules.outsider_prior)) else []
@@ -194,6 +194,16 @@ class MarginalSearch:
             accuracy=self._accuracy(best),
             learned=self._learned(best) if form else {},
         )
+
+    def _left_in_all_data(self, best: Hypothesis) -> tuple[float, tuple[Channel, ...]]:
+        """χ² that the selected set takes off the unchanged model in all data, and what the critics say of the rest.
+
+        A cause outside the catalogue, if it is there, stands out more clearly in all data than in the part searched.
+        """
+        null, whole = self.prepared.null, best
+        if self.prepared.unseen.seen.any():
+            null, whole = in_all_data(self.prepared, best)
+        return null.chi2 - whole.chi2, judge(whole, null, self.index, self.rules)
 
     def _at_ends(self, best: Hypothesis) -> list[str]:
         """Parameters at an end of their range that nature does not have."""
