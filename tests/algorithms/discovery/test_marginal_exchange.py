@@ -101,7 +101,9 @@ def test_two_effects_do_not_take_the_place_of_the_right_one(rng: np.random.Gener
 
 
 @pytest.mark.rng("what is hoped for")
-def test_an_effect_is_hoped_to_bring_the_part_of_its_promise_that_it_has_brought(rng: np.random.Generator) -> None:
+def test_an_effect_is_hoped_to_bring_the_part_of_its_promise_that_it_has_brought(
+    rng: np.random.Generator,
+) -> None:
     search = search_of(rng, {"wavelength_offset.offset": 0.6})
     scored = {one.name: one for one in search.scores(search.null)}
     before = search.hoped(scored["bandwidth"])

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from ...inference import (
 )
 from ...inference.marginal import Point
 from .catalogue import Catalogue
+from .open_orders import best_of_orders
 from .pace import Pace
 from .pairs import Joint
 from .rules import Rules
@@ -51,7 +51,9 @@ class SetSearch:
         self._joint: dict[frozenset[str], Joint] = {}
         self._added_before: set[tuple[frozenset[str], str]] = set()
         self._short: set[tuple[frozenset[str], str]] = set()  # fits that came far behind before
-        self._brought: dict[str, float] = {}  # largest part of its promise that an effect brought where it was fitted
+        self._brought: dict[
+            str, float
+        ] = {}  # largest part of its promise that an effect brought where it was fitted
         self._exchanged: set[frozenset[str]] = set()  # sets whose members were left out and exchanged
 
     def posterior(self, found: Hypothesis) -> float:
@@ -107,7 +109,9 @@ class SetSearch:
             ]
             smaller = max([smaller, *map(self._keep, others)], key=self.posterior)
             if len(smaller.effects) > 1 and not self._is_surely_better(larger, smaller):
-                smaller = self._settled(smaller)  # it may be what is left of a larger one, its twins not fitted
+                smaller = self._settled(
+                    smaller
+                )  # it may be what is left of a larger one, its twins not fitted
         return larger if self._is_surely_better(larger, smaller) else smaller
 
     def _from_thickness(self, found: Hypothesis, other: Hypothesis) -> Hypothesis:
@@ -171,7 +175,7 @@ class SetSearch:
         return self._of_size(size)[: self.rules.beam]
 
     def hoped(self, one: Scored) -> float:
-        """What an effect may bring: all that it promises and little more, but no larger part than where it was fitted."""
+        """What an effect may bring: what it promises and little more, but no larger part than where it was fitted."""
         most = 1.0 / self.rules.least_of_promise
         return max(one.gain, 0.0) * min(most, self._brought.get(one.name, most))
 
@@ -365,7 +369,7 @@ class SetSearch:
                 sought = effect.search.sought or effect.local
                 one = proposed(effect, items, base) if sought else scorer.score(name, items)
                 if not sought:
-                    one = self._best_order(one, elsewhere, name, items, base)
+                    one = best_of_orders(one, elsewhere, name, items, base)
                 if one is not None:
                     found.append(one)
             self._scores[key] = sorted(found, key=lambda one: -one.gain)
@@ -378,29 +382,6 @@ class SetSearch:
         if base.items:
             columns = joined(columns, effect_columns(point, base.items))
         return Scorer(point, columns, self.rules.sizes)
-
-    def _best_order(
-        self,
-        here: Scored | None,
-        elsewhere: Sequence[Scorer],
-        name: str,
-        items: tuple[Coordinate, ...],
-        base: Hypothesis,
-    ) -> Scored | None:
-        """The score of an effect, or that in another fringe order, if it promises more in spite of that."""
-        best = here
-        for scorer in elsewhere:
-            own = scorer.score(name, items)
-            if own is None:
-                continue
-            gain = own.gain - (scorer.point.cost - base.point.cost)
-            if best is None or gain > best.gain:
-                try:
-                    start = jumped(scorer.point, items, list(self._part(items, own.step, 1.0)))
-                except OutOfRangeError:  # no layer is thinner than nothing
-                    continue
-                best = replace(own, gain=gain, start=start)
-        return best
 
     def _added(self, base: Hypothesis, one: Scored) -> Hypothesis:
         """The set with one effect more."""
