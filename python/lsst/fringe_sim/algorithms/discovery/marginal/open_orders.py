@@ -6,8 +6,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from ....errors import OutOfRangeError
-from ...inference import Coordinate, Hypothesis, jumped
+from ...inference import Coordinate, Hypothesis, Point, effect_columns, joined, jumped
 from .scores import Scored, Scorer
+
+
+def scorer_at(point: Point, base: Hypothesis, sizes: Sequence[float]) -> Scorer:
+    """Scores beside a set at a point; ``sizes``: see `Rules`."""
+    columns = point.level_columns
+    if base.items:
+        columns = joined(columns, effect_columns(point, base.items))
+    return Scorer(point, columns, sizes)
 
 
 def best_of_orders(

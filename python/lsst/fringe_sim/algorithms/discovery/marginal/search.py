@@ -13,21 +13,19 @@ from ....errors import OutOfRangeError
 from ...inference import (
     Coordinate,
     Hypothesis,
-    effect_columns,
     fit,
     in_open_orders,
     in_whole_orders,
-    joined,
     jumped,
     led,
 )
 from ...inference.marginal import Point
 from .catalogue import Catalogue
-from .open_orders import best_of_orders
+from .open_orders import best_of_orders, scorer_at
 from .pace import Pace
 from .pairs import Joint
 from .rules import Rules
-from .scores import Scored, Scorer, best_gain, proposed
+from .scores import Scored, best_gain, proposed
 
 PARTS = 1.0, 0.3
 """Parts of a linear step of several parameters from which they are fitted: the whole may lead too far."""
@@ -359,8 +357,8 @@ class SetSearch:
         key = frozenset(base.effects)
         if key not in self._scores:
             point = led(base.point)
-            scorer = self._scorer(point, base)
-            elsewhere = [self._scorer(one, base) for one in in_open_orders(point)]
+            scorer = scorer_at(point, base, self.rules.sizes)
+            elsewhere = [scorer_at(one, base, self.rules.sizes) for one in in_open_orders(point)]
             found = []
             for name, items in self.catalogue.items.items():
                 if not self.catalogue.may_add(name, base.effects):
@@ -375,13 +373,6 @@ class SetSearch:
             self._scores[key] = sorted(found, key=lambda one: -one.gain)
             self._joint[key] = scorer.joint()
         return self._scores[key]
-
-    def _scorer(self, point: Point, base: Hypothesis) -> Scorer:
-        """Scores beside a set at a point."""
-        columns = point.level_columns
-        if base.items:
-            columns = joined(columns, effect_columns(point, base.items))
-        return Scorer(point, columns, self.rules.sizes)
 
     def _added(self, base: Hypothesis, one: Scored) -> Hypothesis:
         """The set with one effect more."""
