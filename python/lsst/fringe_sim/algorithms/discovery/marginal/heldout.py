@@ -110,8 +110,7 @@ def judge_unseen(prepared: Prepared, found: Hypothesis) -> Unseen:
 
 def _whole(prepared: Prepared, found: Point) -> Point:
     """A fit to the part searched, at all cells, which have the shape of their thickness there."""
-    cells = together(prepared)
-    return in_all_cells(unseen_too(prepared, found, cells), cells)
+    return in_all_cells(prepared, unseen_too(prepared, found, together(prepared)))
 
 
 def _fitted(prepared: Prepared, point: Point, shape: CellShape) -> Point:

@@ -34,12 +34,18 @@ def in_own_cells(first: Point) -> Point:
     return relaxed(in_best_orders(relaxed(first, rounds=4)), rounds=6)
 
 
-def in_all_cells(point: Point, cells: CellData) -> Point:
-    """The same point, its cells shaped by the thickness of them all: where it was continued slopes were guessed.
+def in_all_cells(prepared: Prepared, point: Point) -> Point:
+    """A point at all cells, those held out with the shape of the thickness of all: it was guessed there.
 
-    ``cells``: those searched and those held out.
+    Cells that were searched keep the shape with which effects were chosen.
     """
-    _, shape = in_shape(point, cells)
+    cells, held = together(prepared), prepared.unseen.seen.ravel()
+    old, (_, own) = point.problem.forward.shape, in_shape(point, cells)
+    shape = replace(
+        old,
+        gradient=np.where(held, own.gradient, old.gradient),
+        hessian=np.where(held, own.hessian, old.hessian),
+    )
     problem = replace(point.problem, forward=replace(point.problem.forward, shape=shape))
     return problem.at(point.settings, point.levels, point.thickness_um)
 
@@ -165,7 +171,7 @@ class CellLesson:
     def of(cls, prepared: Prepared, found: Hypothesis) -> CellLesson:
         """From a set of effects that was fitted to the part searched."""
         cells, unseen = together(prepared), prepared.unseen.seen
-        start = in_all_cells(unseen_too(prepared, with_corrections(found.point), cells), cells)
+        start = in_all_cells(prepared, unseen_too(prepared, with_corrections(found.point), cells))
         left = (start.problem.data.value - start.levels[:, np.newaxis] * start.value).reshape(cells.shape)
         cells = cells.restricted(~(spoiled_cells(left, cells.weight > 0.0) & unseen))
         # Cells without data stay where they were.
