@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
-from lsst.fringe_sim.algorithms.discovery.marginal import preparation
+from lsst.fringe_sim.algorithms.discovery.marginal.neighbour_order import in_order_of_neighbours
 from lsst.fringe_sim.algorithms.discovery.marginal.preparation import Prepared, _in_parts, prepare
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
 from lsst.fringe_sim.algorithms.inference import CellShape
@@ -158,8 +158,25 @@ def test_cells_at_a_rim_in_another_order_do_not_steepen_it(per_cell: float) -> N
     wrong = field.copy()
     wrong[9:12, 8] += order_um
     wrong[10, 9] += order_um
-    found = preparation._in_order_of_neighbours(wrong, seen, order_um, preparation.ORDER_SIDE)
+    found = in_order_of_neighbours(wrong, seen, order_um)
     np.testing.assert_allclose(found[seen], field[seen], atol=1e-9)
+
+
+@pytest.mark.rng("a part of a sensor in another order")
+@pytest.mark.parametrize("per_cell", [0.1, 0.35])
+def test_a_part_of_a_sensor_in_another_order_comes_back(per_cell: float, rng: np.random.Generator) -> None:
+    """Beside cells that have no data, with noise, and single cells in other orders; the rest stays."""
+    order_um = 0.3
+    y, x = np.mgrid[:24, :24]
+    field = 15.0 + order_um * (per_cell * x + 0.004 * (y - 12) ** 2 + 0.05 * rng.standard_normal(x.shape))
+    seen = ~((y >= 12) & (x < 8))
+    wrong = field.copy()
+    wrong[4:11, 9:16] += order_um
+    wrong[20, 20] -= 2.0 * order_um
+    wrong[2, 3] += order_um
+    found = in_order_of_neighbours(wrong, seen, order_um)
+    np.testing.assert_allclose(found[seen], field[seen], atol=1e-9)
+    np.testing.assert_array_equal(found[~seen], field[~seen])
 
 
 def test_half_an_order_on_an_island_is_kept() -> None:
@@ -168,5 +185,5 @@ def test_half_an_order_on_an_island_is_kept() -> None:
     y, x = np.mgrid[:16, :16]
     field = 15.0 + 0.4 * order_um * (np.hypot(y - 8, x - 8) < 3)
     everywhere = np.ones(field.shape, dtype=bool)
-    found = preparation._in_order_of_neighbours(field, everywhere, order_um, preparation.ORDER_SIDE)
+    found = in_order_of_neighbours(field, everywhere, order_um)
     np.testing.assert_array_equal(found, field)

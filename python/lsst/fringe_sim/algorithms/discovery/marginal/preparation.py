@@ -34,6 +34,7 @@ from ..preparation import are_few
 from ..start import robust_surface, starting_thickness
 from ..validation import BLOCKS_ACROSS, FEWEST_ROWS
 from .known_thickness import as_known, stated_sigma_um, with_error_of_map
+from .neighbour_order import in_order_of_neighbours
 from .noise import is_measured, measured_noise, neighbour_scatter
 from .rules import Rules
 
@@ -42,10 +43,6 @@ MARGIN_UM = 0.8
 
 OPEN_ORDERS = 6
 """Fringe orders on both sides in which every fit of a few pixels is tried, as in the present search."""
-
-ORDER_SIDE = 5
-"""Side of the part about a cell whose median tells its fringe order [cells]: at a corner of the data a quarter of it
-has any, of which four of nine may be in other orders; with the next smaller side it were one of four."""
 
 FIRST_ERROR_UM = 0.004  # Error of the first thickness [µm]: it is one of steps of 0.01
 SURFACE_CELLS = 8.0  # Distance of the knots of the surface whose slope limits the size of cells [cells]
@@ -316,31 +313,7 @@ def _whole(point: Point, cells: CellData) -> FloatArray:
     """
     field = point.thickness_um.reshape(cells.shape[1:])
     order_um = point.problem.forward.order_um
-    return continued(_in_order_of_neighbours(field, cells.seen, order_um, ORDER_SIDE), cells.seen)
-
-
-def _in_order_of_neighbours(field: FloatArray, seen: BoolArray, order_um: float, side: int) -> FloatArray:
-    """A thickness moved by whole fringe orders to within half of one of its neighbours, whose medians are a plane.
-
-    A few cells in another order, mostly at the rim of a part without data, have a slope that is an order per cell.
-    With that slope they fit best where they are.
-    """
-    known = np.where(seen, field, np.nan)
-    middle = _around(known, seen, side)
-    for axis, away in enumerate(np.indices((side, side)).reshape(2, -1) - side // 2):
-        steps = _around(np.diff(known, axis=axis, append=np.nan), seen, side)
-        steps[np.isnan(steps).all(axis=-1)] = 0.0
-        middle -= np.nanmedian(steps, axis=-1)[:, np.newaxis] * away
-    whole = field.copy()
-    whole[seen] -= order_um * np.round((field[seen] - np.nanmedian(middle, axis=-1)) / order_um)
-    return whole
-
-
-def _around(values: FloatArray, where: BoolArray, side: int) -> FloatArray:
-    """Values about every place that is asked for, ``(N, side²)``; beyond the edges there are none."""
-    padded = np.pad(values, side // 2, constant_values=np.nan)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (side, side))
-    return np.array(windows[where].reshape(-1, side**2))
+    return continued(in_order_of_neighbours(field, cells.seen, order_um), cells.seen)
 
 
 def _data(cells: CellData) -> Data:

@@ -173,7 +173,7 @@ class SetSearch:
         return self._of_size(size)[: self.rules.beam]
 
     def hoped(self, one: Scored) -> float:
-        """What an effect may bring: what it promises and little more, but no larger part than where it was fitted."""
+        """What an effect may bring: all that it promises and little more, no larger part than where it was fitted."""
         most = 1.0 / self.rules.least_of_promise
         return max(one.gain, 0.0) * min(most, self._brought.get(one.name, most))
 
