@@ -48,7 +48,9 @@ def search_of(rng: np.random.Generator, hidden: dict[str, float], map_um: float 
     if map_um is not None:
         problem = replace(problem, thickness_sigma_um=np.full(thickness.size, map_um), known=True)
     null = fit((), (), relaxed(problem.at({}, np.ones(8), thickness.ravel()), rounds=6))
-    return SetSearch(Catalogue.of(effects, null.point.problem), null, Rules(), lambda text: None, lambda found: True)
+    return SetSearch(
+        Catalogue.of(effects, null.point.problem), null, Rules(), lambda text: None, lambda found: True
+    )
 
 
 def fitted(search: SetSearch, *names: str) -> Hypothesis:
@@ -102,7 +104,9 @@ def test_two_effects_do_not_take_the_place_of_the_right_one(rng: np.random.Gener
 
 
 @pytest.mark.rng("what is hoped for")
-def test_an_effect_is_hoped_to_bring_the_part_of_its_promise_that_it_has_brought(rng: np.random.Generator) -> None:
+def test_an_effect_is_hoped_to_bring_the_part_of_its_promise_that_it_has_brought(
+    rng: np.random.Generator,
+) -> None:
     search = search_of(rng, {"wavelength_offset.offset": 0.6})
     scored = {one.name: one for one in search.scores(search.null)}
     before = search.hoped(scored["bandwidth"])

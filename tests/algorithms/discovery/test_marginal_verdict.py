@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover, search
+from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
 from lsst.fringe_sim.algorithms.discovery.marginal.accuracy import evidence_within, told_accuracy
 from lsst.fringe_sim.algorithms.discovery.marginal.heldout import Unseen, judge_unseen
 from lsst.fringe_sim.algorithms.discovery.marginal.lesson import in_all_data
@@ -212,21 +212,6 @@ def test_the_significance_is_that_which_was_asked_for(rng: np.random.Generator) 
     verdict = verdict_of(cube_of(rng, flats_of({})), "vignetting", significance=1.0 - 1e-9)
     assert verdict.verdict == "unexplained"
     assert verdict.global_probability > 1e-3
-
-
-# What is left to others --------------------------------------------------------------------------------------
-
-
-@pytest.mark.rng("another core answers")
-def test_what_the_present_search_answers_is_said(rng: np.random.Generator) -> None:
-    cube = cube_of(rng, flats_of({}))
-    assert search._why_not_marginal(cube) == ""
-    small = replace(cube, image=cube.image[:, :12], variance=cube.variance[:, :12], mask=cube.mask[:, :12])
-    assert "16 rows" in search._why_not_marginal(small)
-    known = np.full((SIDE, SIDE), 15.0, np.float32)
-    assert search._why_not_marginal(replace(cube, thickness=known, layer="adhesive")) == ""
-    told = verdict_of(small, "vignetting")
-    assert any("the present search answers" in note for note in told.notes)
 
 
 def test_a_round_tells_what_it_takes_still(monkeypatch: pytest.MonkeyPatch) -> None:

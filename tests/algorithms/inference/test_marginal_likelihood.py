@@ -60,9 +60,15 @@ def point_of(rng: np.random.Generator, settings: dict[str, float], response: flo
     return relaxed(problem.at({}, np.ones(len(WAVELENGTHS)), thickness))
 
 
+LINE = np.stack([np.ones(len(WAVELENGTHS)), np.linspace(-1.0, 1.0, len(WAVELENGTHS))], axis=1)
+
+
 @pytest.mark.rng("evidence of cells")
-def test_evidence_is_that_of_a_dense_calculation(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("shapes", [None, LINE[:, :1], LINE], ids=["free", "one factor", "a line"])
+def test_evidence_is_that_of_a_dense_calculation(shapes: np.ndarray | None, rng: np.random.Generator) -> None:
+    """Of levels that are free, and of levels that are known but for some shapes over the exposures."""
     point = point_of(rng, {})
+    point = replace(point, problem=replace(point.problem, level_shapes=shapes))
     problem, waves, cells = point.problem, *point.value.shape
     columns = point.level_columns
     information, score = point.information(columns, columns), point.score(columns)
@@ -70,7 +76,6 @@ def test_evidence_is_that_of_a_dense_calculation(rng: np.random.Generator) -> No
     ours -= 0.5 * np.linalg.slogdet(information)[1]
     # All levels, responses and thicknesses in one matrix.
     dense = np.zeros((waves * cells, waves + 2 * cells))
-    prior, pull = np.zeros(dense.shape[1]), np.zeros(dense.shape[1])
     for w in range(waves):
         for c in range(cells):
             row = w * cells + c
@@ -78,6 +83,10 @@ def test_evidence_is_that_of_a_dense_calculation(rng: np.random.Generator) -> No
             dense[row, w] = root * point.value[w, c]
             dense[row, waves + c] = root * point.levels[w] * point.value[w, c]
             dense[row, waves + cells + c] = root * point.levels[w] * point.slope[w, c]
+    if shapes is not None:
+        dense = np.hstack([dense[:, :waves] @ shapes, dense[:, waves:]])
+        waves = shapes.shape[1]
+    prior, pull = np.zeros(dense.shape[1]), np.zeros(dense.shape[1])
     prior[waves : waves + cells] = problem.response_sigma**-2
     prior[waves + cells : waves + 2 * cells] = problem.thickness_sigma_um**-2
     away = problem.thickness_um - point.thickness_um

@@ -89,7 +89,7 @@ def find_rings(
     if used.sum() < FEWEST_CELLS:
         return None
     whole = _samples(image, used, y_px, x_px)
-    factor = math.ceil(max(image.shape) / SIDE_CELLS)
+    factor = min(math.ceil(max(image.shape) / SIDE_CELLS), *image.shape)
     if factor == 1:
         return _found_in(whole, whole, middle)
     return _found_in(_averaged(image, used, y_px, x_px, factor), whole, middle) or _found_in(

@@ -141,10 +141,9 @@ def search_exposures(
             return _no_answer(model, poor, cube)
         begun, budget = time.monotonic(), chosen.time_budget_s
         search: _Search | MarginalSearch | None = None
-        left_to_present = _why_not_marginal(cube)
         try:
             with time_limit(begun + (1.0 - FOR_JUDGEMENT) * budget):
-                if chosen.core == "marginal" and not left_to_present:
+                if chosen.core == "marginal":
                     from .marginal import MarginalSearch  # is made of parts of this package
 
                     search = MarginalSearch(cube, model, effects, rng, chosen, say, exposures)
@@ -152,27 +151,12 @@ def search_exposures(
                 say("fitting the thickness with the unchanged model")
                 prepared = prepare(cube, model, effects, chosen.most_cells, exposures)
                 search = _Search(cube, prepared, model, effects, chosen, rng, say)
-                if chosen.core == "marginal":
-                    search.remark(f"the present search answers, not core marginal: {left_to_present}")
                 return search.run()
         except OutOfTimeError:
             say(f"the search is stopped: {budget:g} s were given")
             stopped = search.best_so_far(begun + budget) if search is not None else None
             reason = f"{budget:g} s did not suffice to fit the unchanged model"
             return stopped or replace(_no_answer(model, reason, cube, too_poor=False), complete=False)
-
-
-MARGINAL_ROWS = 1
-"""Rows and columns of pixels from which on the search on one likelihood can split data into a part that is searched
-and one that is held out, and measure the noise of both: 16 leave as many second differences beside blocks that are
-held out as `marginal.noise` asks for, 12 do not."""
-
-
-def _why_not_marginal(cube: FringeCube) -> str:
-    """Why the search on one likelihood cannot search such data, or nothing."""
-    if min(cube.shape[1:]) < MARGINAL_ROWS:
-        return f"fewer than {MARGINAL_ROWS} rows or columns of pixels"
-    return ""
 
 
 def _no_answer(model: FringeModel, reason: str, cube: FringeCube, *, too_poor: bool = True) -> Verdict:
@@ -228,11 +212,6 @@ class _Search:
         """Go on with other field and noise; ``singles``: where effects alone are known to be."""
         self.prepared, self.cells, self._singles = prepared, prepared.problem.cells, singles
         self.notes = [*self.headers, *prepared.told]
-
-    def remark(self, text: str) -> None:
-        """Say something in the notes of the verdict."""
-        self.headers = (*self.headers, text)
-        self.notes.append(text)
 
     @property
     def _places(self) -> int:

@@ -37,9 +37,10 @@ def with_common_offset(point: Point) -> Point:
 def common_offset_um(point: Point) -> float:
     """Move of the first thickness with which fringes are the most alike, level and contrast being free [µm].
 
-    0 where the thickness is not known, or where it is the best of those tried.
+    0 where the thickness is not known, where it is the best of those tried, or where a few cells do not tell level
+    and contrast of every exposure.
     """
-    if not point.problem.known:
+    if not point.problem.known or point.problem.levels_known:
         return 0.0
     offsets = OFFSETS * point.problem.forward.order_um
     left = np.array([_unlike(point, offset) for offset in offsets])

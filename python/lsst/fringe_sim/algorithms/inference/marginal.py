@@ -57,6 +57,11 @@ class Problem:
         return np.eye(len(self.data.value)) if self.level_shapes is None else self.level_shapes
 
     @property
+    def levels_known(self) -> bool:
+        """Whether levels are known but for some shapes: a few cells cannot tell those of all exposures."""
+        return self.level_shapes is not None
+
+    @property
     def free_levels(self) -> int:
         """How many parameters the levels have, the first of all dense ones."""
         return len(self.data.value) if self.level_shapes is None else self.level_shapes.shape[1]

@@ -369,9 +369,7 @@ def _best_of_parts(
             for item, change in zip(items, step[waves:], strict=True)
         }
         try:
-            new = point.moved(
-                point.levels_after(part * step), point.thickness_um + part * moved_um, settings
-            )
+            new = point.moved(point.levels_after(part * step), point.thickness_um + part * moved_um, settings)
         except OutOfRangeError:  # no layer is thinner than nothing
             continue
         if not math.isfinite(new.cost):

@@ -140,11 +140,12 @@ def _gain_of_waves(prepared: Prepared, found: Hypothesis) -> float:
 
 def _gain_of_single_waves(prepared: Prepared, found: Hypothesis) -> float:
     """The same of every wavelength in turn, predicted by all others: levels, cells and effects are integrated."""
-    return sum(
-        sign * (one.log_evidence - _without_wave(one, wave).log_evidence)
-        for one, sign in ((found, 1.0), (prepared.null, -1.0))
-        for wave in range(len(found.point.levels))
+    waves = range(len(found.point.levels))
+    after, before = (
+        np.array([one.log_evidence - _without_wave(one, wave).log_evidence for wave in waves])
+        for one in (found, prepared.null)
     )
+    return float((after - before).sum())
 
 
 def _without_wave(found: Hypothesis, wave: int) -> Hypothesis:

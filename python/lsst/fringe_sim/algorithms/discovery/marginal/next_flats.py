@@ -69,14 +69,9 @@ class FlatForecast:
             pairs.sort(key=lambda pair: pair.separation_after)
             found.append(RankedMeasurement(measurement, tuple(pairs)))
         found.sort(key=lambda item: -item.separation)
-        if self._few and found:
+        if self.best.point.problem.levels_known and found:
             found.append(more_pixels(found[0], self.cells))
         return tuple(sorted(found, key=lambda item: -item.separation))
-
-    @property
-    def _few(self) -> bool:
-        """Whether the pixels are so few that the levels are known up to a common factor."""
-        return self.best.point.problem.level_shapes is not None
 
     def _further(
         self, name: str, rivals: Mapping[str, Hypothesis], here: Seen
@@ -119,7 +114,7 @@ class FlatForecast:
             dark_time_s=times,
         )
         reach = max(float(thickness.min()) - MARGIN_UM, 0.05), float(thickness.max()) + MARGIN_UM
-        if self._few:
+        if self.best.point.problem.levels_known:
             reach = forward.range_um  # levels are those of the same thicknesses
         model = series.conditions(self.model)
         return Forward(model, forward.catalogue, geometry, forward.shape, reach)
@@ -181,7 +176,7 @@ class FlatForecast:
         problem = replace(problem, data=data, thickness_um=at, thickness_sigma_um=sigma / np.sqrt(several))
         point = Point(problem, {}, np.ones(len(value)), at, value, slope)
         columns = point.bare_columns(point.whitened(asked))
-        shapes = np.ones((len(value), 1)) if self._few else np.eye(len(value))
+        shapes = np.ones((len(value), 1)) if problem.levels_known else np.eye(len(value))
         levels = point.bare_columns(shapes.T[:, :, np.newaxis] * point.response)
         across = point.information(levels, columns)
         within = np.linalg.solve(point.information(levels, levels), across)

@@ -71,7 +71,7 @@ class Prepared:
     @property
     def few(self) -> bool:
         """Whether there are too few pixels to tell the levels of the flats from the fringes."""
-        return self.problem.level_shapes is not None
+        return self.problem.levels_known
 
     @property
     def measured(self) -> bool:
@@ -156,12 +156,13 @@ def _in_parts(larger: Prepared, smaller: Prepared) -> tuple[FloatArray, CellShap
 
 
 def _held_out(good: BoolArray, fraction: float, rng: np.random.Generator) -> BoolArray:
-    """Pixels that no selection sees, in blocks; none where the others, ``good`` ones, would not tell their noise."""
+    """Pixels that no selection sees, in blocks; none where the other ``good`` ones would not tell the noise."""
     rows, columns = good.shape
     side = min(BLOCKS_ACROSS, max(min(good.shape) // FEWEST_ROWS, 3))
     blocks = rng.permutation(side * side).reshape(side, side) < round(fraction * side * side)
     held = blocks[np.ix_(np.arange(rows) * side // rows, np.arange(columns) * side // columns)]
-    return np.asarray(held if is_measured(good & ~held) else np.zeros_like(held))
+    some = is_measured(good & ~held) and not are_few(good.shape, int(good.sum()))
+    return np.asarray(held if some else np.zeros_like(held))
 
 
 def _masked(cube: FringeCube, out: BoolArray) -> FringeCube:
@@ -191,7 +192,8 @@ def _in_cells(
     else:  # cells that are held out lie where the map has them
         mapped = np.isfinite(stated)
         first = stated if mapped.all() else np.where(mapped, stated, continued(stated, mapped))
-    problem = as_known(_problem(cells, model, effects, first, exposures), cells)
+    few = are_few(cells.shape[1:], int((cells.seen | unseen.seen).sum()))
+    problem = as_known(_problem(cells, model, effects, first, exposures, few), cells)
     # The first thickness does not believe in the contrast of the model; it stays until that of the data is known.
     known = replace(problem, thickness_sigma_um=KNOWN_UM)
     start = known.at({}, np.ones(cells.shape[0]), problem.thickness_um)
@@ -325,11 +327,11 @@ def _problem(
     effects: Sequence[Effect],
     thickness_um: FloatArray,
     exposures: Exposures | None,
+    few: bool,
 ) -> Problem:
-    """Problem about a first thickness ``(ny, nx)``; of a few pixels levels and fringe order are hardly told by data."""
+    """Problem about a first thickness ``(ny, nx)``; a few pixels hardly tell levels and fringe order."""
     error = FIRST_ERROR_UM if cells.thickness_um is None else float(np.median(stated_sigma_um(cells)))
     shape = CellShape.of_field(thickness_um, cells.cell_px, error)
-    few = are_few(cells.shape[1:], int(cells.seen.sum()))
     orders = OPEN_ORDERS if few and cells.thickness_um is None else 0
     margin = MARGIN_UM + orders * float(model.fringe_order_um(np.median(cells.wavelength_nm)))
     limits = (max(float(thickness_um.min()) - margin, 0.05), float(thickness_um.max()) + margin)

@@ -64,7 +64,7 @@ class Scorer:
 
     def _behind(self, beside: Point) -> float:
         """Log likelihood that a thickness which was led away from its map costs, at the best of the linear model."""
-        free = 0.5 * float(self.gradient @ np.linalg.solve(self.base, self.gradient))
+        free = 0.5 * float(self.gradient @ solved(self.base, self.gradient))
         return max(self.point.linear_cost - free - beside.linear_cost, 0.0)
 
     def joint(self) -> Joint:

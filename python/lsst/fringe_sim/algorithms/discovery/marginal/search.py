@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -13,20 +13,19 @@ from ....errors import OutOfRangeError
 from ...inference import (
     Coordinate,
     Hypothesis,
-    effect_columns,
     fit,
     in_open_orders,
     in_whole_orders,
-    joined,
     jumped,
     led,
 )
 from ...inference.marginal import Point
 from .catalogue import Catalogue
+from .open_orders import best_of_orders, scorer_at
 from .pace import Pace
 from .pairs import Joint
 from .rules import Rules
-from .scores import Scored, Scorer, best_gain, proposed
+from .scores import Scored, best_gain, proposed
 
 PARTS = 1.0, 0.3
 """Parts of a linear step of several parameters from which they are fitted: the whole may lead too far."""
@@ -288,7 +287,7 @@ class SetSearch:
         if base.effects and not missing:
             worth = [group for group in worth if self._may_lead(base, group[0])]
         fewest = 0 if base.effects and not missing else self.rules.fewest_refits
-        if base is self.null and base.point.problem.orders and not self.leaves_noise(base):
+        if base is self.null and base.point.problem.levels_known and not self.leaves_noise(base):
             worth, most = groups, len(groups)  # derivatives in a wrong order promise nothing
         number = max(fewest, min(len(worth), most or self.rules.refits))
         if missing:
@@ -373,7 +372,7 @@ class SetSearch:
 
     def _scored_at(self, point: Point, base: Hypothesis) -> list[Scored]:
         """The same by derivatives at one point; effects that propose themselves do so at that of the set."""
-        scorer = scorer_at(point, base, self.rules.sizes)
+        scorer = scorer_at(point, base, self.rules.sizes, base.point)
         elsewhere = [scorer_at(one, base, self.rules.sizes) for one in in_open_orders(point)]
         found = []
         for name, items in self.catalogue.items.items():
@@ -398,7 +397,7 @@ class SetSearch:
         items = self.catalogue.items[one.name]
         with self.pace.fit():
             found = None if one.start is None else self._fit(names, (*base.items, *items), one.start)
-            if found is None or (base.point.problem.orders and not self._is_kept(base, found, one)):
+            if found is None or (base.point.problem.levels_known and not self._is_kept(base, found, one)):
                 known = [] if found is None else [found]
                 found = max([*known, self._fitted(base, one, names, items)], key=self.posterior)
         self._added_before.add(step)
