@@ -57,7 +57,9 @@ def _links(
     here, there = tuple(begin), tuple(rest)
     both = seen[here] & seen[there]
     steps = np.where(both, field[there] - field[here], np.nan)
-    beside = steps[both] - np.nanmedian(_around(steps, both), axis=-1)
+    beside = steps[both]
+    if beside.size:
+        beside = beside - np.nanmedian(_around(steps, both), axis=-1)
     turns = np.round(beside / order_um)
     return number[here][both], number[there][both], turns, np.abs(beside / order_um - turns)
 
