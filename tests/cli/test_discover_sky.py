@@ -1,6 +1,7 @@
 """``fringe-sim discover`` with the set-up of a telescope."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +80,23 @@ def test_a_dry_run_writes_nothing(
     assert run([*given, "--dry-run"]) == 0
     assert "11 frames of 72 x 64" in capsys.readouterr().out
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("product", ["FringeFrame", "FringeTemplates"])
+def test_templates_beside_the_frames_are_passed_over(
+    sky: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str], product: str
+) -> None:
+    """`fringe-sim sky --templates` writes them into the folder of its frames."""
+    night = tmp_path / "night"
+    night.mkdir()
+    for file in sorted(sky[0].glob("sky_*.fits"))[:2]:
+        shutil.copy(file, night)
+    template = fits.PrimaryHDU()
+    template.header["PRODUCT"] = product
+    template.writeto(night / "fringe_0.fits")
+    given = ["discover", str(night), "--setup", "monocam", "--thickness", sky[1], "--dry-run", "--out"]
+    assert run([*given, str(tmp_path / "verdict")]) == 0
+    assert "2 frames of 72 x 64" in capsys.readouterr().out
 
 
 def test_a_night_and_its_map_on_the_sky_are_as_recorded(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery.channels import Channel
+from lsst.fringe_sim.algorithms.discovery.marginal import search as sets_module
 from lsst.fringe_sim.algorithms.discovery.marginal.catalogue import Catalogue
 from lsst.fringe_sim.algorithms.discovery.marginal.critics import is_out_of_reach
 from lsst.fringe_sim.algorithms.discovery.marginal.naming import name_effects
@@ -33,8 +34,8 @@ FEW = ("epoxy_index", "bandwidth", "wavelength_offset", "contrast_loss")
 NOISE = 2e-3
 
 
-def search_of(rng: np.random.Generator, hidden: dict[str, float]) -> SetSearch:
-    """A search among a few effects on a few cells."""
+def search_of(rng: np.random.Generator, hidden: dict[str, float], map_um: float | None = None) -> SetSearch:
+    """A search among a few effects on a few cells; ``map_um``: error of their thickness if it is known."""
     effects = [effect for effect in EFFECTS if effect.name in FEW]
     place = np.arange(12.0)
     thickness = 14.0 + 0.035 * place + 0.02 * place[:, np.newaxis]
@@ -44,6 +45,8 @@ def search_of(rng: np.random.Generator, hidden: dict[str, float]) -> SetSearch:
     value = forward.predict(hidden, thickness.ravel())[0]
     value = value + NOISE * rng.standard_normal(value.shape)
     problem = Problem(Data(value, np.full(value.shape, NOISE**-2.0)), forward, thickness.ravel(), 1e-5)
+    if map_um is not None:
+        problem = replace(problem, thickness_sigma_um=np.full(thickness.size, map_um), known=True)
     null = fit((), (), relaxed(problem.at({}, np.ones(8), thickness.ravel()), rounds=6))
     return SetSearch(
         Catalogue.of(effects, null.point.problem), null, Rules(), lambda text: None, lambda found: True
@@ -146,6 +149,47 @@ def test_twins_of_an_effect_that_brings_less_than_it_promised_are_fitted_as_far_
     assert tried == [first, last, *others[:fitted]]
     best = search.best_of(1)[0]
     assert best.effects == (max(tried, key=brought.__getitem__),)
+
+
+@pytest.mark.rng("what a wrong lead costs")
+def test_no_effect_promises_what_a_thickness_led_astray_has_cost(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the fringes are as like an order beside the map, which has an error of 2 nm."""
+    hidden = {"contrast_loss.factor": 0.7}
+    straight, astray = (
+        search_of(np.random.default_rng(rng.bit_generator.seed_seq), hidden, 0.002) for _ in "ab"
+    )
+    expected = {one.name: one for one in straight.scores(straight.null)}
+    away = 0.31
+
+    def led(point: Point) -> Point:
+        return point.moved(point.levels, point.thickness_um + away)
+
+    monkeypatch.setattr(sets_module, "led", led)
+    found = {one.name: one for one in astray.scores(astray.null)}
+    assert found["contrast_loss"].gain == pytest.approx(expected["contrast_loss"].gain)
+    assert found["contrast_loss"].step[0] == pytest.approx(-0.3, rel=0.1)
+    brings = fitted(astray, "contrast_loss").log_evidence - astray.null.log_evidence
+    assert max(one.gain for one in found.values()) < 1.1 * brings
+    best = max(
+        (pair for joint in astray._joints[frozenset()] for pair in joint.best_pairs(best_gain, 0.0)),
+        key=lambda one: one.gain,
+    )
+    assert best.gain < 1.1 * brings
+    point = led(astray.null.point)
+    alone = Scorer(point, point.level_columns, Rules().sizes)
+    assert alone.score("epoxy_index", astray.catalogue.items["epoxy_index"]).gain > 10.0 * brings
+
+
+@pytest.mark.rng("a lead that is right")
+def test_an_effect_promises_with_the_thickness_that_it_is_led_to(rng: np.random.Generator) -> None:
+    """An adhesive with another index, which moves the fringes by a third of an order beside the map."""
+    search = search_of(rng, {"epoxy_index.offset": 0.01}, 0.002)
+    promised = {one.name: one for one in search.scores(search.null)}["epoxy_index"]
+    brings = fitted(search, "epoxy_index").log_evidence - search.null.log_evidence
+    assert promised.step[0] == pytest.approx(0.01, rel=0.2)
+    assert promised.gain == pytest.approx(brings, rel=0.2)
 
 
 @pytest.mark.rng("orders of a set")

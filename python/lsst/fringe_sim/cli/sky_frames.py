@@ -11,8 +11,9 @@ import click
 from ..errors import InputError
 from ..instrument.detector import Detector
 from ..model import FringeModel, Setup
-from ..products import SkyFrames, SkyFringe
+from ..products import FringeFrame, FringeTemplates, SkyFrames, SkyFringe
 from ..products.same_light import pixels_digest
+from ..resources import complete_fits
 from .inputs import placed_model, read_map
 
 
@@ -32,8 +33,8 @@ class SkyData:
 def read_sky_frames(paths: Sequence[str], setup: Setup, thickness: str | None) -> SkyData:
     """Read frames and map.
 
-    ``paths``: FITS files written as `SkyFringe`, or folders with them. ``thickness``: file with the map; it is
-    needed.
+    ``paths``: FITS files written as `SkyFringe`, or folders with them, templates in which are passed over.
+    ``thickness``: file with the map; it is needed.
     """
     if thickness is None:
         raise InputError("--thickness", None, "a thickness map: frames of the sky alone do not tell it")
@@ -61,7 +62,7 @@ def _files(paths: Sequence[str]) -> list[Path]:
     for text in paths:
         path = Path(text)
         if path.is_dir():
-            found.extend(sorted(path.glob("*.fits")))
+            found.extend(file for file in sorted(path.glob("*.fits")) if not _is_template(file))
         elif path.is_file():
             found.append(path)
         else:
@@ -69,3 +70,9 @@ def _files(paths: Sequence[str]) -> list[Path]:
     if not found:
         raise InputError("sky frames", list(paths), "FITS files, or folders with them")
     return found
+
+
+def _is_template(file: Path) -> bool:
+    """Whether a file holds what ``fringe-sim sky --templates`` writes beside the frames."""
+    with complete_fits(file) as hdus:
+        return hdus[0].header.get("PRODUCT") in (FringeFrame.__name__, FringeTemplates.__name__)

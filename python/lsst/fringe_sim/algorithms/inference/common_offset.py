@@ -15,12 +15,12 @@ OFFSETS = np.arange(-18, 19) / 12.0
 
 @kept(8)
 def led(point: Point) -> Point:
-    """The same problem with the thickness about which the data are linear; where it is not known, the point itself.
+    """The same problem with the thickness about which the data are linear; the point itself where they are so there.
 
     An effect that shifts the phase by a radian or more has no derivative that leads to it at the first thickness.
     """
-    offset_um = common_offset_um(point)
-    if offset_um == 0.0:
+    offset_um, step_um = common_offset_um(point), (OFFSETS[1] - OFFSETS[0]) * point.problem.forward.order_um
+    if abs(offset_um) <= 0.5 * step_um:
         return point
     return point.moved(point.levels, point.problem.thickness_um + offset_um)
 

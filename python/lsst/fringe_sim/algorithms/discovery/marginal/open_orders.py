@@ -10,12 +10,12 @@ from ...inference import Coordinate, Hypothesis, Point, effect_columns, joined, 
 from .scores import Scored, Scorer
 
 
-def scorer_at(point: Point, base: Hypothesis, sizes: Sequence[float]) -> Scorer:
-    """Scores beside a set at a point; ``sizes``: see `Rules`."""
+def scorer_at(point: Point, base: Hypothesis, sizes: Sequence[float], beside: Point | None = None) -> Scorer:
+    """Scores beside a set at a point; ``sizes``: see `Rules`, ``beside``: see `Scorer`."""
     columns = point.level_columns
     if base.items:
         columns = joined(columns, effect_columns(point, base.items))
-    return Scorer(point, columns, sizes)
+    return Scorer(point, columns, sizes, beside)
 
 
 def best_of_orders(

@@ -43,9 +43,10 @@ class Joint:
     items: tuple[Coordinate, ...]
     information: FloatArray  # (K, K)
     gradient: FloatArray  # (K,)
+    behind: float = 0.0  # log likelihood that the point lacks of the one to which effects are added
 
     @classmethod
-    def of(cls, point: Point, free: Columns, single: dict[str, Promised]) -> Joint:
+    def of(cls, point: Point, free: Columns, single: dict[str, Promised], behind: float = 0.0) -> Joint:
         """From the effects one by one; ``free``: columns that are free."""
         items = tuple(item for one in single.values() for item in one.items)
         if not items:
@@ -64,7 +65,7 @@ class Joint:
         across = np.concatenate([one.across for one in single.values()], axis=1)
         matrix = point.information(every, every) - point.information(every, free) @ across
         gradient = np.concatenate([one.gradient for one in single.values()])
-        return cls(place, items, 0.5 * (matrix + matrix.T), gradient)
+        return cls(place, items, 0.5 * (matrix + matrix.T), gradient, behind)
 
     def best_pairs(
         self,
@@ -81,9 +82,10 @@ class Joint:
         for pair in itertools.combinations([name for name in self.place if name not in without], 2):
             own = np.concatenate([self.place[name] for name in pair])
             matrix, gradient = self.information[np.ix_(own, own)], self.gradient[own]
-            if 0.5 * float(gradient @ np.linalg.lstsq(matrix, gradient)[0]) <= least:
+            if 0.5 * float(gradient @ np.linalg.lstsq(matrix, gradient)[0]) - self.behind <= least:
                 continue
             gain, step = gain_of(matrix, gradient, np.array([self.items[k].scale for k in own]))
+            gain -= self.behind
             if gain > least and all(self.items[k].side * x >= 0.0 for k, x in zip(own, step, strict=True)):
                 found.append(ScoredPair((pair[0], pair[1]), gain, step))
         return sorted(found, key=lambda one: -one.gain)

@@ -190,7 +190,8 @@ def _in_cells(
     if stated is None:
         first = continued(starting_thickness(model, cells), cells.seen)
     else:  # cells that are held out lie where the map has them
-        first = np.where(np.isfinite(stated), stated, continued(stated, np.isfinite(stated)))
+        mapped = np.isfinite(stated)
+        first = stated if mapped.all() else np.where(mapped, stated, continued(stated, mapped))
     few = are_few(cells.shape[1:], int((cells.seen | unseen.seen).sum()))
     problem = as_known(_problem(cells, model, effects, first, exposures, few), cells)
     # The first thickness does not believe in the contrast of the model; it stays until that of the data is known.

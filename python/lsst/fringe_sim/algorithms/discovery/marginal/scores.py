@@ -48,17 +48,28 @@ class Scored:
 
 
 class Scorer:
-    """Scores of effects beside what is free at a point."""
+    """Scores of effects beside what is free at a point.
 
-    def __init__(self, point: Point, columns: Columns, sizes: Sequence[float]) -> None:
+    ``beside``: the point to which effects are added, by default the same one. What they bring counts from there.
+    """
+
+    def __init__(
+        self, point: Point, columns: Columns, sizes: Sequence[float], beside: Point | None = None
+    ) -> None:
         self.point, self.columns, self.sizes = point, columns, sizes
         self.base = point.information(columns, columns)
         self.gradient = point.score(columns) - columns.log_det
         self.single: dict[str, Promised] = {}
+        self.behind = 0.0 if beside is None or beside is point else self._behind(beside)
+
+    def _behind(self, beside: Point) -> float:
+        """Log likelihood that a thickness which was led away from its map costs, at the best of the linear model."""
+        free = 0.5 * float(self.gradient @ solved(self.base, self.gradient))
+        return max(self.point.linear_cost - free - beside.linear_cost, 0.0)
 
     def joint(self) -> Joint:
         """What the effects that were scored say of each other."""
-        return Joint.of(self.point, self.columns, self.single)
+        return Joint.of(self.point, self.columns, self.single, self.behind)
 
     def score(self, name: str, items: tuple[Coordinate, ...]) -> Scored | None:
         """What an effect promises by its derivatives; by the best of several secants where they may vanish."""
@@ -93,13 +104,14 @@ class Scorer:
                 best, step = gain, np.zeros(len(items))
                 step[few] = part
                 degrees = int(few.sum())
+        best -= self.behind
         if len(items) == 1 and items[0].side * step[0] < 0.0:
             best, step = -1.0, -step
         signature = own.combined(step) - self.columns.combined(across @ step)
         flat = self.point.projected(signature).ravel()
-        fall = max(2.0 * float(gradient @ step) - float(step @ matrix @ step), 0.0)
+        fall = 2.0 * float(gradient @ step) - float(step @ matrix @ step) - 2.0 * self.behind
         unit = flat / max(float(np.linalg.norm(flat)), 1e-300)
-        return Scored(name, best, degrees, step, unit, fall=fall)
+        return Scored(name, best, degrees, step, unit, fall=max(fall, 0.0))
 
 
 def best_gain(matrix: FloatArray, gradient: FloatArray, scale: FloatArray) -> tuple[float, FloatArray]:

@@ -46,12 +46,11 @@ class SetSearch:
     def __post_init__(self) -> None:
         self.pool[frozenset()] = self.null
         self._scores: dict[frozenset[str], list[Scored]] = {}
-        self._joint: dict[frozenset[str], Joint] = {}
+        self._joints: dict[frozenset[str], list[Joint]] = {}
         self._added_before: set[tuple[frozenset[str], str]] = set()
         self._short: set[tuple[frozenset[str], str]] = set()  # fits that came far behind before
-        self._brought: dict[
-            str, float
-        ] = {}  # largest part of its promise that an effect brought where it was fitted
+        # largest part of its promise that an effect brought where it was fitted
+        self._brought: dict[str, float] = {}
         self._exchanged: set[frozenset[str]] = set()  # sets whose members were left out and exchanged
 
     def posterior(self, found: Hypothesis) -> float:
@@ -187,8 +186,10 @@ class SetSearch:
             return
         base = self.without(found, name)
         self.scores(base)
-        joint, least = self._joint[frozenset(base.effects)], self._least_gain(base, 2)
-        for pair in joint.best_pairs(best_gain, least, (name,))[: self.rules.fewest_refits]:
+        least = self._least_gain(base, 2)
+        joints = self._joints[frozenset(base.effects)]
+        pairs = [pair for joint in joints for pair in joint.best_pairs(best_gain, least, (name,))]
+        for pair in sorted(pairs, key=lambda one: -one.gain)[: self.rules.fewest_refits]:
             names = (*base.effects, *pair.names)
             if frozenset(names) in self.pool:
                 continue
@@ -353,26 +354,39 @@ class SetSearch:
         return groups
 
     def scores(self, base: Hypothesis) -> list[Scored]:
-        """All effects that a set lacks, by what one derivative promises; best first."""
+        """All effects that a set lacks, by what one derivative promises; best first.
+
+        Where a thickness that is known may have a phase that is missing in the model, each by the better of the
+        derivatives with it and without.
+        """
         key = frozenset(base.effects)
         if key not in self._scores:
-            point = led(base.point)
-            scorer = scorer_at(point, base, self.rules.sizes)
-            elsewhere = [scorer_at(one, base, self.rules.sizes) for one in in_open_orders(point)]
-            found = []
-            for name, items in self.catalogue.items.items():
-                if not self.catalogue.may_add(name, base.effects):
-                    continue
-                effect = self.catalogue.effects[name]
-                sought = effect.search.sought or effect.local
-                one = proposed(effect, items, base) if sought else scorer.score(name, items)
-                if not sought:
-                    one = best_of_orders(one, elsewhere, name, items, base)
-                if one is not None:
-                    found.append(one)
-            self._scores[key] = sorted(found, key=lambda one: -one.gain)
-            self._joint[key] = scorer.joint()
+            best: dict[str, Scored] = {}
+            self._joints[key] = []
+            for point in dict.fromkeys((base.point, led(base.point))):
+                for one in self._scored_at(point, base):
+                    if one.name not in best or one.gain > best[one.name].gain:
+                        best[one.name] = one
+            self._scores[key] = sorted(best.values(), key=lambda one: -one.gain)
         return self._scores[key]
+
+    def _scored_at(self, point: Point, base: Hypothesis) -> list[Scored]:
+        """The same by derivatives at one point; effects that propose themselves do so at that of the set."""
+        scorer = scorer_at(point, base, self.rules.sizes, base.point)
+        elsewhere = [scorer_at(one, base, self.rules.sizes) for one in in_open_orders(point)]
+        found = []
+        for name, items in self.catalogue.items.items():
+            if not self.catalogue.may_add(name, base.effects):
+                continue
+            effect, one = self.catalogue.effects[name], None
+            if not (effect.search.sought or effect.local):
+                one = best_of_orders(scorer.score(name, items), elsewhere, name, items, base)
+            elif point is base.point:
+                one = proposed(effect, items, base)
+            if one is not None:
+                found.append(one)
+        self._joints[frozenset(base.effects)].append(scorer.joint())
+        return found
 
     def _added(self, base: Hypothesis, one: Scored) -> Hypothesis:
         """The set with one effect more."""
