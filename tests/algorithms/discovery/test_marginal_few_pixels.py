@@ -9,6 +9,7 @@ from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discove
 from lsst.fringe_sim.algorithms.discovery.continuation import continued
 from lsst.fringe_sim.algorithms.discovery.marginal.catalogue import Catalogue
 from lsst.fringe_sim.algorithms.discovery.marginal.heldout import judge_unseen
+from lsst.fringe_sim.algorithms.discovery.marginal.neighbour_order import in_order_of_neighbours
 from lsst.fringe_sim.algorithms.discovery.marginal.next_flats import FlatForecast
 from lsst.fringe_sim.algorithms.discovery.marginal.preparation import OPEN_ORDERS, Prepared, prepare
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
@@ -128,6 +129,15 @@ def test_a_field_of_one_row_goes_on() -> None:
     known = np.ones((1, 9), bool)
     known[0, 3:5] = False
     np.testing.assert_allclose(continued(line, known), line, atol=1e-4)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 6), (2, 2)])
+def test_cells_of_one_row_are_in_the_order_of_their_neighbours(shape: tuple[int, int]) -> None:
+    field = 14.0 + 0.01 * np.arange(float(np.prod(shape))).reshape(shape)
+    torn = field.copy()
+    if field.size > 4:  # of fewer, no median tells which is torn
+        torn[0, 1] += 0.3
+    np.testing.assert_allclose(in_order_of_neighbours(torn, np.ones(shape, bool), 0.3), field, atol=1e-12)
 
 
 @pytest.mark.rng("rings in two rows")

@@ -66,6 +66,8 @@ def _links(
 
 def _around(values: FloatArray, where: BoolArray) -> FloatArray:
     """Values about every place that is asked for, ``(N, SIDE²)``; beyond the edges there are none."""
+    if not where.any():
+        return np.zeros((0, SIDE**2))
     padded = np.pad(values, SIDE // 2, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (SIDE, SIDE))
     return np.array(windows[where].reshape(-1, SIDE**2))

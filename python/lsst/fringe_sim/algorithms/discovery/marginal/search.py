@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ....array_types import FloatArray
-from ....errors import OutOfRangeError
 from ...inference import (
     Coordinate,
     Hypothesis,
@@ -26,6 +25,7 @@ from .pace import Pace
 from .pairs import Joint
 from .rules import Rules
 from .scores import Scored, best_gain, proposed
+from .starts import best_start
 
 PARTS = 1.0, 0.3
 """Parts of a linear step of several parameters from which they are fitted: the whole may lead too far."""
@@ -194,7 +194,7 @@ class SetSearch:
             if frozenset(names) in self.pool:
                 continue
             items = tuple(item for one in pair.names for item in self.catalogue.items[one])
-            start = self._best_start(base, items, [self._part(items, pair.step, part) for part in PARTS])
+            start = best_start(base, items, [self._part(items, pair.step, part) for part in PARTS])
             both = self._fit(names, (*base.items, *items), base.point if start is None else start)
             brings = both.log_evidence - base.log_evidence
             self.say(f"  {'+'.join(names)}: promised {pair.gain:.1f} together, brings {brings:.1f}")
@@ -413,7 +413,7 @@ class SetSearch:
         """The fit from the linear step; from elsewhere where that does not bring what it promised, or repeats."""
         every = (*base.items, *items)
         parts = PARTS[:1] if len(items) == 1 else PARTS
-        first = self._best_start(base, items, [self._part(items, one.step, part) for part in parts])
+        first = best_start(base, items, [self._part(items, one.step, part) for part in parts])
         found = self._fit(names, every, base.point if first is None else first)
         kept = self._is_kept(base, found, one)
         if len(items) > 1 or (kept and not items[0].repeat):
@@ -427,7 +427,7 @@ class SetSearch:
             if item.repeat:
                 value = found.point.settings[item.key]
                 tried += [np.array([value + turn * item.repeat]) for turn in (-1.0, 1.0)]
-            other = self._best_start(base, items, tried)
+            other = best_start(base, items, tried)
             new = found if other is None else self._fit(names, every, other)
             if new.log_evidence <= found.log_evidence:
                 break
@@ -441,18 +441,3 @@ class SetSearch:
     @staticmethod
     def _part(items: Sequence[Coordinate], step: FloatArray, part: float) -> FloatArray:
         return np.array([item.null for item in items]) + part * step
-
-    @staticmethod
-    def _best_start(
-        base: Hypothesis, items: tuple[Coordinate, ...], tried: Sequence[FloatArray]
-    ) -> Point | None:
-        """The best of other values that is better than none, or nothing."""
-        best = None
-        for values in tried:
-            try:
-                start = jumped(base.point, items, list(values))
-            except OutOfRangeError:  # no layer is thinner than nothing
-                continue
-            if start.cost < (base.point if best is None else best).cost:
-                best = start
-        return best

@@ -1,0 +1,22 @@
+"""Where fits of a set with further effects begin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ....array_types import FloatArray
+from ....errors import OutOfRangeError
+from ...inference import Coordinate, Hypothesis, Point, jumped
+
+
+def best_start(base: Hypothesis, items: tuple[Coordinate, ...], tried: Sequence[FloatArray]) -> Point | None:
+    """The best of other values that is better than none, or nothing."""
+    best = None
+    for values in tried:
+        try:
+            start = jumped(base.point, items, list(values))
+        except OutOfRangeError:  # no layer is thinner than nothing
+            continue
+        if start.cost < (base.point if best is None else best).cost:
+            best = start
+    return best
