@@ -12,6 +12,7 @@ from lsst.fringe_sim.algorithms.discovery.marginal import search as sets_module
 from lsst.fringe_sim.algorithms.discovery.marginal.catalogue import Catalogue
 from lsst.fringe_sim.algorithms.discovery.marginal.critics import is_out_of_reach
 from lsst.fringe_sim.algorithms.discovery.marginal.naming import name_effects
+from lsst.fringe_sim.algorithms.discovery.marginal.pairs import ScoredPair
 from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
 from lsst.fringe_sim.algorithms.discovery.marginal.scores import Scored, Scorer, best_gain
 from lsst.fringe_sim.algorithms.discovery.marginal.search import SetSearch
@@ -190,6 +191,39 @@ def test_an_effect_promises_with_the_thickness_that_it_is_led_to(rng: np.random.
     brings = fitted(search, "epoxy_index").log_evidence - search.null.log_evidence
     assert promised.step[0] == pytest.approx(0.01, rel=0.2)
     assert promised.gain == pytest.approx(brings, rel=0.2)
+
+
+@pytest.mark.rng("twins of a pair")
+@pytest.mark.parametrize("better", [True, False])
+def test_a_pair_with_a_twin_in_the_place_of_one_effect_is_fitted_where_the_pair_is_better(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, better: bool
+) -> None:
+    """Pairs of which noise decides the order, and what they bring is not what they promise."""
+    search = search_of(rng, {})
+    names = ("epoxy_index", "bandwidth", "wavelength_offset")
+    ends = {"epoxy_index": [1.0, 0.0], "bandwidth": [0.0, 1.0], "wavelength_offset": [0.1, 0.99]}
+    scored = [Scored(name, 500.0, 1, np.ones(1), np.array(ends[name])) for name in names]
+    pairs = [
+        ("epoxy_index", "bandwidth"),
+        ("bandwidth", "wavelength_offset"),
+        ("epoxy_index", "wavelength_offset"),
+    ]
+    promised = [ScoredPair(pair, 900.0 - rank, np.ones(2)) for rank, pair in enumerate(pairs)]
+    one = replace(search.null, effects=("contrast_loss",), log_evidence=search.null.log_evidence + 800.0)
+    search._keep(one)
+    tried = []
+
+    def added(base: Hypothesis, pair: ScoredPair, effects: tuple[str, ...]) -> Hypothesis:
+        tried.append(pair.names)
+        brings = 850.0 if better and pair.names == pairs[0] else 790.0
+        return replace(base, effects=effects, log_evidence=base.log_evidence + brings)
+
+    monkeypatch.setattr(search, "scores", lambda base: scored)
+    monkeypatch.setattr(search, "_pair_added", added)
+    joint = SimpleNamespace(best_pairs=lambda gain_of, least, without: promised)
+    search._joints[frozenset()] = [joint]  # type: ignore[list-item]
+    search._exchange_for_two(one, "contrast_loss")
+    assert tried == (pairs if better else pairs[:2])
 
 
 @pytest.mark.rng("orders of a set")

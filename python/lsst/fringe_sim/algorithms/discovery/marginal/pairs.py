@@ -34,6 +34,14 @@ class ScoredPair:
     gain: float  # of log evidence
     step: FloatArray  # linear step of the parameters of both from null
 
+    def is_twin_of(self, other: ScoredPair, signatures: dict[str, FloatArray], least: float) -> bool:
+        """Whether it has one effect of another pair, and a twin of the other one, by their cosine."""
+        own, its = set(self.names) - set(other.names), set(other.names) - set(self.names)
+        if len(own) != 1 or len(its) != 1:
+            return False
+        (mine,), (theirs,) = own, its
+        return abs(float(signatures[mine] @ signatures[theirs])) > least
+
 
 @dataclass(frozen=True, eq=False)
 class Joint:

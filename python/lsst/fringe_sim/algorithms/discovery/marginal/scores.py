@@ -24,6 +24,7 @@ from ...inference import (
 )
 from ...inference.coordinates import SECANT
 from .pairs import FEW, Joint, Promised
+from .rules import Rules
 from .smooth import beside_smooth
 from .window import Window
 
@@ -112,6 +113,21 @@ class Scorer:
         fall = 2.0 * float(gradient @ step) - float(step @ matrix @ step) - 2.0 * self.behind
         unit = flat / max(float(np.linalg.norm(flat)), 1e-300)
         return Scored(name, best, degrees, step, unit, fall=max(fall, 0.0))
+
+
+def grouped(scored: Sequence[Scored], rules: Rules) -> list[list[Scored]]:
+    """Twins together, the best first."""
+    groups: list[list[Scored]] = []
+    for one in scored:
+        if one.gain <= 0.0 and len(groups) >= rules.fewest_refits:
+            break
+        for group in groups:
+            if abs(float(group[0].signature @ one.signature)) > rules.twin_cosine:
+                group.append(one)
+                break
+        else:
+            groups.append([one])
+    return groups
 
 
 def best_gain(matrix: FloatArray, gradient: FloatArray, scale: FloatArray) -> tuple[float, FloatArray]:

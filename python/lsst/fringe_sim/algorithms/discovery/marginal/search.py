@@ -22,9 +22,9 @@ from ...inference.marginal import Point
 from .catalogue import Catalogue
 from .open_orders import best_of_orders, scorer_at
 from .pace import Pace
-from .pairs import Joint
+from .pairs import Joint, ScoredPair
 from .rules import Rules
-from .scores import Scored, best_gain, proposed
+from .scores import Scored, best_gain, grouped, proposed
 from .starts import best_start
 
 PARTS = 1.0, 0.3
@@ -181,24 +181,37 @@ class SetSearch:
         return any(self._is_surely_better(one, best) for one in self._of_size(len(best.effects) + 1)[:1])
 
     def _exchange_for_two(self, found: Hypothesis, name: str) -> None:
-        """Fit pairs in the place of one member, as far as they promise to come near the best set."""
+        """Fit pairs in the place of one member, as far as they promise to come near the best set.
+
+        Where one is better than the set, those with a twin in the place of one of its effects are fitted too.
+        """
         if not self.catalogue.may_leave((name,), found.effects):
             return
         base = self.without(found, name)
-        self.scores(base)
+        signatures = {one.name: one.signature for one in self.scores(base)}
         least = self._least_gain(base, 2)
         joints = self._joints[frozenset(base.effects)]
         pairs = [pair for joint in joints for pair in joint.best_pairs(best_gain, least, (name,))]
-        for pair in sorted(pairs, key=lambda one: -one.gain)[: self.rules.fewest_refits]:
+        better: list[ScoredPair] = []
+        for number, pair in enumerate(sorted(pairs, key=lambda one: -one.gain)):
             names = (*base.effects, *pair.names)
-            if frozenset(names) in self.pool:
+            wanted = number < self.rules.fewest_refits or any(
+                pair.is_twin_of(one, signatures, self.rules.twin_cosine) for one in better
+            )
+            if not wanted or frozenset(names) in self.pool:
                 continue
-            items = tuple(item for one in pair.names for item in self.catalogue.items[one])
-            start = best_start(base, items, [self._part(items, pair.step, part) for part in PARTS])
-            both = self._fit(names, (*base.items, *items), base.point if start is None else start)
-            brings = both.log_evidence - base.log_evidence
-            self.say(f"  {'+'.join(names)}: promised {pair.gain:.1f} together, brings {brings:.1f}")
-            self._keep(both)
+            both = self._pair_added(base, pair, names)
+            if self.posterior(both) > self.posterior(found):
+                better.append(pair)
+
+    def _pair_added(self, base: Hypothesis, pair: ScoredPair, names: tuple[str, ...]) -> Hypothesis:
+        """The set with two effects more."""
+        items = tuple(item for one in pair.names for item in self.catalogue.items[one])
+        start = best_start(base, items, [self._part(items, pair.step, part) for part in PARTS])
+        both = self._fit(names, (*base.items, *items), base.point if start is None else start)
+        brings = both.log_evidence - base.log_evidence
+        self.say(f"  {'+'.join(names)}: promised {pair.gain:.1f} together, brings {brings:.1f}")
+        return self._keep(both)
 
     def _of_size(self, size: int) -> list[Hypothesis]:
         """All sets of so many effects, best first."""
@@ -282,7 +295,7 @@ class SetSearch:
         ``missing``: a member of a larger set that was taken out here; its twins are refitted in any case.
         """
         key = frozenset(base.effects)
-        groups = self._groups([one for one in self.scores(base) if (key, one.name) not in self._short])
+        groups = grouped([one for one in self.scores(base) if (key, one.name) not in self._short], self.rules)
         worth = [group for group in groups if group[0].gain > self.catalogue.price]
         if base.effects and not missing:
             worth = [group for group in worth if self._may_lead(base, group[0])]
@@ -338,20 +351,6 @@ class SetSearch:
         best = max(self.posterior(known) for known in self.pool.values())
         behind = best - self.rules.class_width - self.posterior(base) + number * self.catalogue.price
         return self.rules.least_of_promise * behind
-
-    def _groups(self, scored: Sequence[Scored]) -> list[list[Scored]]:
-        """Twins together, the best first."""
-        groups: list[list[Scored]] = []
-        for one in scored:
-            if one.gain <= 0.0 and len(groups) >= self.rules.fewest_refits:
-                break
-            for group in groups:
-                if abs(float(group[0].signature @ one.signature)) > self.rules.twin_cosine:
-                    group.append(one)
-                    break
-            else:
-                groups.append([one])
-        return groups
 
     def scores(self, base: Hypothesis) -> list[Scored]:
         """All effects that a set lacks, by what one derivative promises; best first.
