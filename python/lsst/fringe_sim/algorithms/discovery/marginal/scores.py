@@ -23,6 +23,7 @@ from ...inference import (
     solved,
 )
 from ...inference.coordinates import SECANT
+from .island_places import covered
 from .pairs import FEW, Joint, Promised
 from .rules import Rules
 from .smooth import beside_smooth
@@ -193,11 +194,11 @@ def _best_island(
     best: tuple[float, Window, Point, BoolArray] | None = None
     for values in proposals:
         settings = {**point.settings, **{item.key: item.clipped(values[item.parameter]) for item in items}}
-        covered = _covered(effect, items, settings, point)
-        if not covered.any():
+        on = covered(effect, items, settings, point)
+        if not on.any():
             continue
-        window = windows.setdefault(covered.tobytes(), Window.about(point, covered))
-        part, where = window.point, covered[window.inside]
+        window = windows.setdefault(on.tobytes(), Window.about(point, on))
+        part, where = window.point, on[window.inside]
         try:
             start = in_best_orders(
                 part.moved(part.levels, part.thickness_um, settings), where, rounds=FIRST_ROUNDS
@@ -208,11 +209,3 @@ def _best_island(
         if best is None or gain > best[0]:
             best = gain, window, start, where
     return None if best is None else best[1].joined(in_best_orders(best[2], best[3]))
-
-
-def _covered(
-    effect: Effect, items: tuple[Coordinate, ...], settings: dict[str, float], point: Point
-) -> BoolArray:
-    """Cells in which a local effect is."""
-    values = {item.parameter: settings[item.key] for item in items}
-    return np.asarray(effect.coverage(values, point.problem.forward.geometry).ravel() > 0.0)

@@ -20,6 +20,7 @@ from ...inference import (
 )
 from ...inference.marginal import Point
 from .catalogue import Catalogue
+from .island_places import moved_island
 from .open_orders import best_of_orders, scorer_at
 from .pace import Pace
 from .pairs import Joint, ScoredPair
@@ -395,7 +396,7 @@ class SetSearch:
             return self.pool[frozenset(names)]
         items = self.catalogue.items[one.name]
         with self.pace.fit():
-            found = None if one.start is None else self._fit(names, (*base.items, *items), one.start)
+            found = None if one.start is None else self._proposed(one, names, (*base.items, *items))
             if found is None or (base.point.problem.levels_known and not self._is_kept(base, found, one)):
                 known = [] if found is None else [found]
                 found = max([*known, self._fitted(base, one, names, items)], key=self.posterior)
@@ -405,6 +406,19 @@ class SetSearch:
             self._brought[one.name] = max(self._brought.get(one.name, 0.0), brings / one.gain)
         self.say(f"  {'+'.join(names)}: promised {one.gain:.1f}, brings {brings:.1f}{self.pace.text}")
         return self._keep(found)
+
+    def _proposed(self, one: Scored, names: tuple[str, ...], items: tuple[Coordinate, ...]) -> Hypothesis:
+        """The fit from what an effect proposes; of an island from the best place about that, too."""
+        assert one.start is not None
+        found, effect = self._fit(names, items, one.start), self.catalogue.effects[one.name]
+        own = self.catalogue.items[one.name]
+        start = moved_island(effect, own, found.point) if effect.local else None
+        while start is not None:
+            new = self._fit(names, items, start)
+            if new.log_evidence <= found.log_evidence:
+                break
+            found, start = new, moved_island(effect, own, new.point)
+        return found
 
     def _fitted(
         self, base: Hypothesis, one: Scored, names: tuple[str, ...], items: tuple[Coordinate, ...]
