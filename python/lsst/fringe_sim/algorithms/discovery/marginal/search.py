@@ -26,7 +26,7 @@ from .pace import Pace
 from .pairs import Joint, ScoredPair
 from .rules import Rules
 from .scores import Scored, best_gain, grouped, proposed
-from .starts import best_start
+from .starts import best_start, part_of, without_keys
 
 PARTS = 1.0, 0.3
 """Parts of a linear step of several parameters from which they are fitted: the whole may lead too far."""
@@ -208,7 +208,7 @@ class SetSearch:
     def _pair_added(self, base: Hypothesis, pair: ScoredPair, names: tuple[str, ...]) -> Hypothesis:
         """The set with two effects more."""
         items = tuple(item for one in pair.names for item in self.catalogue.items[one])
-        start = best_start(base, items, [self._part(items, pair.step, part) for part in PARTS])
+        start = best_start(base, items, [part_of(items, pair.step, part) for part in PARTS])
         both = self._fit(names, (*base.items, *items), base.point if start is None else start)
         brings = both.log_evidence - base.log_evidence
         self.say(f"  {'+'.join(names)}: promised {pair.gain:.1f} together, brings {brings:.1f}")
@@ -268,12 +268,7 @@ class SetSearch:
         items = tuple(item for item in found.items if item.effect != name)
         own = {item.key: item.null for item in found.items if item.effect == name}
         start = jumped(found.point, [i for i in found.items if i.effect == name], list(own.values()))
-        return self._fit(names, items, self._without_keys(start, set(own)))
-
-    @staticmethod
-    def _without_keys(point: Point, keys: set[str]) -> Point:
-        settings = {key: value for key, value in point.settings.items() if key not in keys}
-        return point.moved(point.levels, point.thickness_um, settings)
+        return self._fit(names, items, without_keys(start, set(own)))
 
     def _fit(self, names: Sequence[str], items: Sequence[Coordinate], start: Point) -> Hypothesis:
         """A fit that is as good as it has to be beside the best one that is known."""
@@ -426,7 +421,7 @@ class SetSearch:
         """The fit from the linear step; from elsewhere where that does not bring what it promised, or repeats."""
         every = (*base.items, *items)
         parts = PARTS[:1] if len(items) == 1 else PARTS
-        first = best_start(base, items, [self._part(items, one.step, part) for part in parts])
+        first = best_start(base, items, [part_of(items, one.step, part) for part in parts])
         found = self._fit(names, every, base.point if first is None else first)
         kept = self._is_kept(base, found, one)
         if len(items) > 1 or (kept and not items[0].repeat):
@@ -450,7 +445,3 @@ class SetSearch:
     def _is_kept(self, base: Hypothesis, found: Hypothesis, one: Scored) -> bool:
         """Whether a fit brings what derivatives promised, or little less."""
         return found.log_evidence - base.log_evidence >= self.rules.least_of_promise * one.gain
-
-    @staticmethod
-    def _part(items: Sequence[Coordinate], step: FloatArray, part: float) -> FloatArray:
-        return np.array([item.null for item in items]) + part * step

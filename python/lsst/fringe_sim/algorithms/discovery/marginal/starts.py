@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from ....array_types import FloatArray
 from ....errors import OutOfRangeError
 from ...inference import Coordinate, Hypothesis, Point, jumped
@@ -20,3 +22,14 @@ def best_start(base: Hypothesis, items: tuple[Coordinate, ...], tried: Sequence[
         if start.cost < (base.point if best is None else best).cost:
             best = start
     return best
+
+
+def part_of(items: Sequence[Coordinate], step: FloatArray, part: float) -> FloatArray:
+    """Values of parameters after a part of a step from null."""
+    return np.array([item.null for item in items]) + part * step
+
+
+def without_keys(point: Point, keys: set[str]) -> Point:
+    """A point without some settings."""
+    settings = {key: value for key, value in point.settings.items() if key not in keys}
+    return point.moved(point.levels, point.thickness_um, settings)
