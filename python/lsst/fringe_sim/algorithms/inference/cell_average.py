@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.polynomial.hermite_e import hermegauss
+from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 from scipy.special import erf
 
@@ -23,6 +24,10 @@ LEAST_PART = 1e-6  # Part of a cell that is none
 UNIFORM = 1.8  # Fourth moment of an even distribution over its squared variance
 
 BLURRED_PLACES = 7  # Places that stand for a blur: a Gaussian of 2 rad rms of fringe phase is right to 1e-3
+
+WIDE_UM, GRID_UM, REACH = 0.04, 0.024, 4.0
+"""Rms of the thickness that a blur brings to a cell, a seventh of a fringe order, from which on it is that of a grid of
+places up to four of its radii away; these are gathered in steps of a twelfth of an order."""
 
 MOST_BENT = 0.4, 0.06
 """Largest skewness over 6 and excess over 24 of them; where fringes are at rest they mean nothing."""
@@ -83,7 +88,39 @@ class CellShape:
         return self._unblurred if blur_px == 0.0 else self._blurred(blur_px)
 
     def _blurred(self, blur_px: float) -> tuple[FloatArray, FloatArray]:
-        return _bent_places(*self._moments(blur_px))
+        moments = self._moments(blur_px)
+        places, shares = _bent_places(*moments)
+        wide = np.flatnonzero(moments[1] > WIDE_UM**2)
+        if not wide.size:
+            return places, shares
+        own_places, own_shares = _gridded(*self._of_blur(blur_px, wide))
+        more = max(len(own_places) - len(places), 0)
+        places, shares = (np.pad(part, ((0, more), (0, 0))) for part in (places, shares))
+        places[:, wide], shares[:, wide] = 0.0, 0.0
+        places[: len(own_places), wide], shares[: len(own_places), wide] = own_places, own_shares
+        return places, shares
+
+    def _of_blur(self, blur_px: float, cells: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+        """Thickness over that of some cells at the places of a grid, ``(M, n)``, and the weight of each, ``(M,)``.
+
+        A sum over an even grid is exact for a Gaussian but for waves shorter than twice its step.
+        """
+        radius = math.sqrt(blur_px**2 + (self.cell_px**2 - (0.0 if self.area else 1.0)) / 12.0)
+        step = min(float(self.cell_px), 0.5 * radius)
+        reach = math.ceil(REACH * radius / step)
+        y, x = step * np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
+        inside = np.hypot(y, x) <= REACH * radius
+        y, x = y[inside], x[inside]
+        weight = np.exp(-0.5 * (y**2 + x**2) / radius**2)
+        away = np.repeat(np.stack([y, x])[:, :, np.newaxis], cells.size, axis=2)
+        if self.edge_px is not None:
+            edge = self.edge_px[:, np.newaxis, cells]
+            beyond = np.where(edge > 0.0, away < -edge, away > -edge)
+            away = np.where(beyond, -2.0 * edge - away, away)
+        (down, along), (yy, yx, xx) = self.gradient[:, cells], self.hessian[:, cells]
+        rise, run = away
+        thickness = down * rise + along * run + 0.5 * (yy * rise**2 + 2.0 * yx * rise * run + xx * run**2)
+        return thickness, weight / weight.sum()
 
     @cached_property
     def _unblurred(self) -> tuple[FloatArray, FloatArray]:
@@ -115,7 +152,10 @@ class CellShape:
         fourth = 3.0 * second**2 - (3.0 - UNIFORM) * (second - blurred) ** 2
         places, shares = places.copy(), shares.copy()
         among = _bent_places if blur_px else _three_places
-        places[:, crossed], shares[:, crossed] = among(mean, second, np.zeros_like(mean), fourth)
+        own = among(mean, second, np.zeros_like(mean), fourth)
+        for values, new in zip((places, shares), own, strict=True):
+            values[:, crossed] = 0.0
+            values[: len(new), crossed] = new
         return places, shares
 
     def _moments(self, blur_px: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -144,6 +184,24 @@ class CellShape:
         reach = np.abs(self.edge_px) / blur_px
         mean = math.sqrt(2.0 / math.pi) * np.exp(-0.5 * reach**2) + reach * erf(reach / math.sqrt(2.0))
         return blur_px * np.sign(self.edge_px) * (mean - reach), blur_px**2 * (reach**2 + 1.0 - mean**2)
+
+
+def _gridded(thickness_um: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The same spread over an even grid of thickness, ``(M, n)``: each place by its four neighbours (Lagrange)."""
+    number = thickness_um.shape[1]
+    first = np.floor(thickness_um / GRID_UM).astype(np.intp)
+    low = first.min(axis=0) - 1
+    x, rows = thickness_um / GRID_UM - first, int((first - low).max()) + 3
+    each = (
+        -x * (x - 1.0) * (x - 2.0) / 6.0, (x + 1.0) * (x - 1.0) * (x - 2.0) / 2.0,
+        -(x + 1.0) * x * (x - 2.0) / 2.0, (x + 1.0) * x * (x - 1.0) / 6.0,
+    )  # fmt: skip
+    shares = np.zeros(rows * number)
+    cells = np.arange(number)
+    for shift, part in enumerate(each):
+        where = (first - low - 1 + shift) * number + cells
+        shares += np.bincount(where.ravel(), (part * weight[:, np.newaxis]).ravel(), rows * number)
+    return GRID_UM * (low + np.arange(rows)[:, np.newaxis]), shares.reshape(rows, number)
 
 
 def _bent_places(

@@ -189,20 +189,9 @@ class CellLesson:
         """Rms of the noise."""
         return self.cells.noise_rms
 
-    def in_all_data(self, unchanged: Point) -> tuple[Hypothesis, Hypothesis]:
-        """The unchanged model and the effects, fitted to all cells.
-
-        ``unchanged``: the model without the effects at the cells searched and those held out.
-        """
-        null = fit((), (), self.problem.at({}, unchanged.levels, unchanged.thickness_um))
-        own = self.start
-        found = fit(
-            self.found.effects,
-            self.found.items,
-            self.problem.at(own.settings, own.levels, own.thickness_um),
-            aim=null.point.cost,
-        )
-        return null, found
+    def start_of(self, problem: Problem) -> Point:
+        """Where the effects are, in another problem of the same cells."""
+        return problem.at(self.start.settings, self.start.levels, self.start.thickness_um)
 
     def teaching(self) -> CellPart:
         """The cells that teach, with the effects fitted to them."""
@@ -228,9 +217,18 @@ class CellLesson:
 
 
 def in_all_data(prepared: Prepared, found: Hypothesis) -> tuple[Hypothesis, Hypothesis]:
-    """The unchanged model and a set that was fitted to the part searched, both fitted to all data after selection."""
+    """The unchanged model and a set that was fitted to the part searched, both fitted to all data after selection.
+
+    Cells held out have the shape of a thickness that was fitted to them.
+    """
     lesson = CellLesson.of(prepared, found)
-    return lesson.in_all_data(unseen_too(prepared, with_corrections(prepared.point), together(prepared)))
+    first = fit(found.effects, found.items, lesson.start_of(lesson.problem))
+    problem = in_all_cells(prepared, first.point).problem
+    own = first.point
+    whole = fit(found.effects, found.items, problem.at(own.settings, own.levels, own.thickness_um))
+    unchanged = unseen_too(prepared, with_corrections(prepared.point), together(prepared))
+    null = fit((), (), problem.at({}, unchanged.levels, unchanged.thickness_um))
+    return null, whole
 
 
 def _point_of(part: Part) -> Point:
