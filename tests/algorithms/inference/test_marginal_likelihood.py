@@ -259,7 +259,7 @@ def test_cells_under_the_rim_of_an_island_are_those_of_pixels(
     assert wrong[:, rim].std() < most
 
 
-@pytest.mark.parametrize(XX)
+@pytest.mark.parametrize(("blur_px", "side", "edge", "most"), [(0.8, SIDE, 3, 0.03), (2.0, 32, 8, 0.08)])
 def test_a_blur_over_some_pixels_is_that_of_pixels(blur_px: float, side: int, edge: int, most: float) -> None:
     # The blur reaches over an eighth of an order, or most of one, and is mirrored at the edges of the sensor.
     forward, thickness = forward_of(1, side)
@@ -274,7 +274,7 @@ def test_a_blur_over_some_pixels_is_that_of_pixels(blur_px: float, side: int, ed
     wrong = (value / level - exact) / exact.std(axis=1, keepdims=True)
     middle = wrong.reshape(-1, side, side)[:, edge:-edge, edge:-edge]
     assert wrong.std() < most
-    assert middle.std() < 4e-3
+    assert middle.std() < 0.1 * most
 
 
 @pytest.mark.rng("scores of noise")

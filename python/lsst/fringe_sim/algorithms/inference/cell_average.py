@@ -26,8 +26,8 @@ UNIFORM = 1.8  # Fourth moment of an even distribution over its squared variance
 BLURRED_PLACES = 7  # Places that stand for a blur: a Gaussian of 2 rad rms of fringe phase is right to 1e-3
 
 WIDE_UM, GRID_UM, REACH = 0.04, 0.024, 4.0
-"""Rms of the thickness that a blur brings to a cell, a seventh of a fringe order, from which on it is that of a grid of
-places up to four of its radii away; these are gathered in steps of a twelfth of an order."""
+"""Rms of the thickness that a blur brings to a cell, a seventh of a fringe order, from which on it is that of a grid
+of places up to four of its radii away; these are gathered in steps of a twelfth of an order."""
 
 MOST_BENT = 0.4, 0.06
 """Largest skewness over 6 and excess over 24 of them; where fringes are at rest they mean nothing."""
