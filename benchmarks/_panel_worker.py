@@ -74,7 +74,9 @@ def _searched(case: PanelCase, fresh: int | None, cap_s: float, core: str) -> di
     except OutOfTimeError:
         answer["verdict"] = "timed out"
     except Exception as error:  # one case that fails must not end the panel
-        answer.update(verdict="failed", error=f"{type(error).__name__}: {error}")
+        # Raised while compiled code is loaded, the end of the time comes out as another error.
+        late = time.process_time() - began >= cap_s
+        answer.update(verdict="timed out" if late else "failed", error=f"{type(error).__name__}: {error}")
     signal.setitimer(signal.ITIMER_PROF, 0.0)
     answer["processor_s"] = round(time.process_time() - began, 1)
     answer["evaluations"] = -1 if counted is None else counted.number
