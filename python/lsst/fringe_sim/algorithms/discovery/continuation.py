@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from ...array_types import BoolArray, FloatArray
 
@@ -23,10 +23,13 @@ def continued(field: FloatArray, known: BoolArray) -> FloatArray:
     matrix = sparse.diags(weight) + STIFFNESS * curvature_of(*field.shape)
     middle = float(field[known].mean())
     right = weight * np.where(known, field - middle, 0.0).ravel()
-    # It is symmetric and positive: no pivot has to be looked for.
+    return np.asarray(middle + factorised(matrix).solve(right).reshape(field.shape))
+
+
+def factorised(matrix: sparse.spmatrix) -> SuperLU:
+    """Factors of a matrix that is symmetric and positive: no pivot has to be looked for."""
     options = {"SymmetricMode": True}
-    factor = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-    return np.asarray(middle + factor.solve(right).reshape(field.shape))
+    return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
 
 
 @lru_cache(maxsize=2)

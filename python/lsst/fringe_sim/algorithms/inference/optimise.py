@@ -101,6 +101,11 @@ def effect_columns(point: Point, items: Sequence[Coordinate], secant: float = SE
     return point.columns(values, slopes, phases)
 
 
+def free_columns(point: Point, items: Sequence[Coordinate]) -> Columns:
+    """Derivatives with respect to the levels, and to the parameters of effects if there are any."""
+    return joined(point.level_columns, effect_columns(point, items)) if items else point.level_columns
+
+
 def _following_um(point: Point, settings: dict[str, float], rounds: int = 2) -> FloatArray:
     """Move of the thickness of every cell with which other settings differ least from a point [µm]."""
     moved = np.zeros_like(point.thickness_um)
@@ -304,9 +309,7 @@ def _tolerance(point: Point, aim: float, least: float) -> float:
 def _walked(items: Sequence[Coordinate], point: Point, rounds: int, aim: float, least: float) -> Point:
     """The same without going back."""
     for _ in range(rounds):
-        columns = point.level_columns
-        if items:
-            columns = joined(columns, effect_columns(point, items))
+        columns = free_columns(point, items)
         step = _step(point, items, columns, point.information(columns, columns))
         new = _best_of_parts(point, items, step, point.followed_um(step, columns))
         if new is None:
@@ -383,9 +386,7 @@ def _best_of_parts(
 
 def _hypothesis(effects: Sequence[str], items: Sequence[Coordinate], point: Point) -> Hypothesis:
     """The log evidence of a fit: levels and parameters leave as a Gaussian."""
-    waves, columns = point.problem.free_levels, point.level_columns
-    if items:
-        columns = joined(columns, effect_columns(point, items))
+    waves, columns = point.problem.free_levels, free_columns(point, items)
     information = point.information(columns, columns)
     levels = information[:waves, :waves]
     across = information[:waves, waves:]

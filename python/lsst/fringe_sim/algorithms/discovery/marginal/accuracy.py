@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ....array_types import FloatArray
-from ...inference import Columns, Hypothesis, Point, effect_columns, joined, solved
+from ...inference import Columns, Hypothesis, Point, free_columns, solved
 from ..accuracy import ACCURACY_SOURCE, MODEL_ACCURACY, TABLE_STEP_NM
 from ..learned_columns import over_wavelength
 from .critics import CRITICS, judge, total_chance
@@ -52,9 +52,7 @@ def model_block(point: Point, accuracy: float) -> Columns:
 
 def evidence_within(found: Hypothesis, accuracy: float) -> float:
     """What the log evidence of a set gains where the model may be wrong by so much."""
-    point, columns = found.point, found.point.level_columns
-    if found.items:
-        columns = joined(columns, effect_columns(point, found.items))
+    point, columns = found.point, free_columns(found.point, found.items)
     block = model_block(point, accuracy)
     across = solved(point.information(columns, columns), point.information(columns, block))
     known = point.information(block, block) - point.information(block, columns) @ across

@@ -11,7 +11,7 @@ import numpy as np
 
 from ....array_types import FloatArray
 from ....effects import ImageGeometry
-from ...inference import Columns, Hypothesis, Point, effect_columns, joined, solved
+from ...inference import Columns, Hypothesis, Point, free_columns, joined, solved
 from ..channels import (
     BANDS,
     Channel,
@@ -47,9 +47,7 @@ class Judged:
         point = found.point
         self.found, self.index, self.noncentral = found, index, noncentral
         self.geometry: ImageGeometry = point.problem.forward.geometry
-        columns = point.level_columns
-        if found.items:
-            columns = joined(columns, effect_columns(point, found.items))
+        columns = free_columns(point, found.items)
         free = len(columns)
         if block is not None:
             columns = joined(columns, block)

@@ -152,19 +152,23 @@ def _without_wave(found: Hypothesis, wave: int) -> Hypothesis:
     """A set fitted to all exposures but one."""
     point, data = found.point, found.point.problem.data
     out = (np.arange(len(data.weight)) == wave)[:, np.newaxis]
-    rest = point.problem_with(Data(data.value, np.where(out, FAINT, 1.0) * data.weight))
-    return fit(found.effects, found.items, rest)
+    return fit(found.effects, found.items, point.problem_with(_faint(data, out)))
+
+
+def _faint(data: Data, out: BoolArray) -> Data:
+    """Data with hardly any weight at some wavelengths ``(W, 1)``."""
+    return Data(data.value, np.where(out, FAINT, 1.0) * data.weight)
 
 
 def _cost_of_waves(found: Hypothesis, out: BoolArray) -> float:
     """Minus the log likelihood of some wavelengths ``(W, 1)``, predicted by a fit to the others."""
     problem, data = found.point.problem, found.point.problem.data
-    seen = replace(problem, data=Data(data.value, np.where(out, FAINT, 1.0) * data.weight))
+    seen = replace(problem, data=_faint(data, out))
     start = seen.at(found.point.settings, found.point.levels, found.point.thickness_um)
     point = fit(found.effects, found.items, start).point
     rest = replace(
         problem,
-        data=Data(data.value, np.where(out, 1.0, FAINT) * data.weight),
+        data=_faint(data, ~out),
         thickness_um=point.thickness_um,
         thickness_sigma_um=point.thickness_sigma_um,
     )

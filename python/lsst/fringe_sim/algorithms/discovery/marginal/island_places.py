@@ -16,7 +16,7 @@ STRIDES = 1.0, 0.5, 0.25
 
 SIZES_PER_REPETITION = 12.0
 REACH = 3  # Cells about an island that a move may cover
-ROUNDS = 2  # Steps of the thickness after which moves are compared
+ROUNDS = 2  # Steps of the thickness after which places of an island are compared
 
 
 def covered(

@@ -189,10 +189,6 @@ class CellLesson:
         """Rms of the noise."""
         return self.cells.noise_rms
 
-    def start_of(self, problem: Problem) -> Point:
-        """Where the effects are, in another problem of the same cells."""
-        return problem.at(self.start.settings, self.start.levels, self.start.thickness_um)
-
     def teaching(self) -> CellPart:
         """The cells that teach, with the effects fitted to them."""
         start = self._at(~self.judged, self.start, self.start.settings)
@@ -222,10 +218,9 @@ def in_all_data(prepared: Prepared, found: Hypothesis) -> tuple[Hypothesis, Hypo
     Cells held out have the shape of a thickness that was fitted to them.
     """
     lesson = CellLesson.of(prepared, found)
-    first = fit(found.effects, found.items, lesson.start_of(lesson.problem))
-    problem = in_all_cells(prepared, first.point).problem
-    own = first.point
-    whole = fit(found.effects, found.items, problem.at(own.settings, own.levels, own.thickness_um))
+    first = fit(found.effects, found.items, replace(lesson.start, problem=lesson.problem))
+    reshaped = in_all_cells(prepared, first.point)
+    whole, problem = fit(found.effects, found.items, reshaped), reshaped.problem
     unchanged = unseen_too(prepared, with_corrections(prepared.point), together(prepared))
     null = fit((), (), problem.at({}, unchanged.levels, unchanged.thickness_um))
     return null, whole

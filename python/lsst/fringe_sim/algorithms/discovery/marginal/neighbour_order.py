@@ -30,7 +30,7 @@ def in_order_of_neighbours(field: FloatArray, seen: BoolArray, order_um: float) 
     first, second, turns, away = (np.concatenate(part) for part in zip(*links, strict=True))
     shape = (field.size, field.size)
     tree = minimum_spanning_tree(csr_matrix((away + LEAST, (first, second)), shape))
-    # Turns from the first to the second cell of a link; 0 is no link, so that they are counted from the largest.
+    # Whole orders of a link, from the first to the second cell and back; a matrix that has no link there has 0.
     known = csr_matrix((np.concatenate([turns, -turns]), (np.r_[first, second], np.r_[second, first])), shape)
     moves = np.zeros(field.size)
     count, part = connected_components(tree, directed=False)
@@ -66,8 +66,6 @@ def _links(
 
 def _around(values: FloatArray, where: BoolArray) -> FloatArray:
     """Values about every place that is asked for, ``(N, SIDE²)``; beyond the edges there are none."""
-    if not where.any():
-        return np.zeros((0, SIDE**2))
     padded = np.pad(values, SIDE // 2, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (SIDE, SIDE))
     return np.array(windows[where].reshape(-1, SIDE**2))

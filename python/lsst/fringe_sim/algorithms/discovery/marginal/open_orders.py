@@ -6,16 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from ....errors import OutOfRangeError
-from ...inference import Coordinate, Hypothesis, Point, effect_columns, joined, jumped
+from ...inference import Coordinate, Hypothesis, Point, free_columns, jumped
 from .scores import Scored, Scorer
 
 
 def scorer_at(point: Point, base: Hypothesis, sizes: Sequence[float], beside: Point | None = None) -> Scorer:
     """Scores beside a set at a point; ``sizes``: see `Rules`, ``beside``: see `Scorer`."""
-    columns = point.level_columns
-    if base.items:
-        columns = joined(columns, effect_columns(point, base.items))
-    return Scorer(point, columns, sizes, beside)
+    return Scorer(point, free_columns(point, base.items), sizes, beside)
 
 
 def best_of_orders(

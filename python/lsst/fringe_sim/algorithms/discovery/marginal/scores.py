@@ -23,7 +23,7 @@ from ...inference import (
     solved,
 )
 from ...inference.coordinates import SECANT
-from .island_places import covered
+from .island_places import ROUNDS, covered
 from .pairs import FEW, Joint, Promised
 from .rules import Rules
 from .smooth import beside_smooth
@@ -31,9 +31,6 @@ from .window import Window
 
 WIDTHS = np.geomspace(0.03, 30.0, 13)
 """Widths of the prior, in its scales, over which a score is the best: departures may be of any size."""
-
-
-FIRST_ROUNDS = 2  # Steps of the thickness after which places that an effect proposes are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,9 +197,7 @@ def _best_island(
         window = windows.setdefault(on.tobytes(), Window.about(point, on))
         part, where = window.point, on[window.inside]
         try:
-            start = in_best_orders(
-                part.moved(part.levels, part.thickness_um, settings), where, rounds=FIRST_ROUNDS
-            )
+            start = in_best_orders(part.moved(part.levels, part.thickness_um, settings), where, rounds=ROUNDS)
         except OutOfRangeError:
             continue
         gain = part.cost - start.cost

@@ -107,9 +107,8 @@ class SetSearch:
             ]
             smaller = max([smaller, *map(self._keep, others)], key=self.posterior)
             if len(smaller.effects) > 1 and not self._is_surely_better(larger, smaller):
-                smaller = self._settled(
-                    smaller
-                )  # it may be what is left of a larger one, its twins not fitted
+                # It may be what is left of a larger one, with twins that are not fitted.
+                smaller = self._settled(smaller)
         return larger if self._is_surely_better(larger, smaller) else smaller
 
     def _from_thickness(self, found: Hypothesis, other: Hypothesis) -> Hypothesis:

@@ -8,11 +8,10 @@ import numpy as np
 from scipy import sparse
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize_scalar
-from scipy.sparse.linalg import splu
 
 from ....array_types import FloatArray
 from ...inference import Point, Problem, kept
-from ..continuation import curvature_of
+from ..continuation import curvature_of, factorised
 
 STIFFEST = 12.0
 """Largest logarithm of the stiffness of a smooth thickness over the curvature of the likelihood of a cell, on both
@@ -80,9 +79,7 @@ def _plate(
 ) -> tuple[float, FloatArray, float]:
     """Log evidence of a stiffness with the plate integrated, what it leaves times the weight, and the noise [µm²]."""
     away = thickness_um - np.average(thickness_um, weights=weight)
-    matrix = (sparse.diags(weight + NO_WEIGHT) + stiffness * curvature_of(*shape)).tocsc()
-    # It is symmetric and positive: no pivot has to be looked for.
-    factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    factor = factorised(sparse.diags(weight + NO_WEIGHT) + stiffness * curvature_of(*shape))
     score = weight * (away - factor.solve(weight * away))
     free = max(int((weight > 0.0).sum()) - PLANE, 1)
     noise = max(float(away @ score), 1e-300) / free
