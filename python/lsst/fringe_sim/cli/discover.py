@@ -52,12 +52,6 @@ def discover(
         kind=click.FloatRange(0.0, 1.0, max_open=True),
         metavar="PART",
     ),
-    core: str = option(
-        "Which search: the present one, or an experimental one on one likelihood, which cannot do everything "
-        "yet and may change in any version.",
-        "present",
-        click.Choice(["present", "marginal"]),
-    ),
     skip_bad: bool = flag("Go on without files that cannot be read."),
     dry_run: bool = flag("Look at every header, say what would be done, write nothing."),
 ) -> None:
@@ -96,7 +90,7 @@ def discover(
             click.echo(f"would search {len(data.sky.frames)} frames of {columns} x {rows} pixels")
             return
         model = data.model(sky_settings(effects.settings))
-        _search_sky(data, model, placement, out, seed, replace(SKY_SEARCH, core=core, **limits), given)
+        _search_sky(data, model, placement, out, seed, replace(SKY_SEARCH, **limits), given)
         return
     if thickness is not None:
         raise InputError("--thickness", thickness, "only with the set-up of a telescope, as lsst_e2v")
@@ -109,7 +103,7 @@ def discover(
         cube,
         model,
         rng=np.random.default_rng(seed),
-        options=SearchOptions(core=core, **limits),
+        options=SearchOptions(**limits),
         report=lambda line: click.echo(line, err=True),
     )
     _write(verdict, folder, residual_pair(cube, model, verdict), section_of_cube(cube, setup), given)

@@ -82,20 +82,14 @@ class SearchHints:
         comes from the pixel itself.
     moves_wavelengths : `bool`
         Whether all that the effect does is to move the wavelengths of exposures.
-    exact : `bool`
-        Whether its form is no guess: electrons, or factors that all pixels of an amplifier share.
     exchangeable : `bool`
         Whether its parameters are draws about null from one distribution, the width of which nobody knows.
-    hides_fringes : `bool`
-        Whether it may take narrow fringes away, so that other effects have nothing left to change.
     sought : `bool`
         Whether it has to be looked for by `Effect.propose`, because at null nothing leads to it.
     places : `tuple` [`str`, ...]
         Parameters that say where the effect is, not how strong: by themselves they change nothing.
     repeats_after : mapping [`str`, `float`]
         Distance after which the fringes look nearly the same again: neighbouring minima of a fit; 0 if they do not.
-    repeats_on_sky : mapping [`str`, `float`]
-        The same for frames of the sky alone: lines of the sky show fringes that the light of flats averages.
     steps : mapping [`str`, `float`]
         Change of a parameter to which the effect is in proportion, if that is less than a thousandth of the prior
         scale; 0 if it is not.
@@ -109,13 +103,10 @@ class SearchHints:
 
     reach: Literal["pixel", "near", "far"] = "pixel"
     moves_wavelengths: bool = False
-    exact: bool = False
     exchangeable: bool = False
-    hides_fringes: bool = False
     sought: bool = False
     places: tuple[str, ...] = ()
     repeats_after: Mapping[str, float] = field(default_factory=dict)
-    repeats_on_sky: Mapping[str, float] = field(default_factory=dict)
     steps: Mapping[str, float] = field(default_factory=dict)
     refinements: Mapping[str, int] = field(default_factory=dict)
     natural_bounds: tuple[float, ...] = ()

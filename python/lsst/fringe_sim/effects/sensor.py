@@ -43,7 +43,6 @@ class DarkPedestal(PlainNullEffect):
     parameters = (
         Parameter("electrons", "electron", 0.0, (-5000.0, 100000.0), 200.0, "level in every exposure"),
     )
-    search = SearchHints(exact=True)
 
     def dark_charge(self, values: Values, geometry: ImageGeometry) -> FloatArray:
         """The pedestal, in every exposure."""
@@ -59,7 +58,6 @@ class DarkCurrent(PlainNullEffect):
     laboratory_only = True
     reference = "EMVA standard 1288, release 4 (dark current of a camera)"
     parameters = (Parameter("rate", "electron/s", 0.0, (-50.0, 2000.0), 2.0, "electrons per second"),)
-    search = SearchHints(exact=True)
 
     def dark_charge(self, values: Values, geometry: ImageGeometry) -> FloatArray:
         """The rate, times the length of each exposure."""
@@ -84,7 +82,7 @@ class ChargeDiffusion(PlainNullEffect):
     acts_on = "image"
     reference = "Lage 2019, doi 10.48550/arXiv.1911.09577 (a few um rms in 100 um of silicon)"
     parameters = (Parameter("sigma", "px", 0.0, (0.0, 5.0), 0.4, "rms radius along one axis"),)
-    search = SearchHints(reach="near", hides_fringes=True)
+    search = SearchHints(reach="near")
 
     def change_image(self, image: FloatArray, values: Values, geometry: ImageGeometry) -> FloatArray:
         """Blur along both axes; exact for the band-limited image that the samples define, mirrored at the edges."""
@@ -224,7 +222,7 @@ class AmplifierGain(PlainNullEffect):
         Parameter(name, "", 0.0, (-0.5, 0.5), 0.01, f"true over stated gain of {name}, minus 1")
         for name in AMPLIFIERS
     )
-    search = SearchHints(exact=True, exchangeable=True)
+    search = SearchHints(exchangeable=True)
 
     def change_image(self, image: FloatArray, values: Values, geometry: ImageGeometry) -> FloatArray:
         """Divide by the gain of the amplifier that reads the sample; a gain common to all is one of the level."""
@@ -242,7 +240,7 @@ class AmplifierOffset(PlainNullEffect):
     parameters = tuple(
         Parameter(name, "electron", 0.0, (-5000.0, 5000.0), 50.0, f"offset of {name}") for name in AMPLIFIERS
     )
-    search = SearchHints(exact=True, exchangeable=True)
+    search = SearchHints(exchangeable=True)
 
     def change_image(self, image: FloatArray, values: Values, geometry: ImageGeometry) -> FloatArray:
         """Let the offset be its part of the level of the amplifier that reads the sample, and light the rest."""

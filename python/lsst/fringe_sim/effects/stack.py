@@ -146,10 +146,6 @@ class SiliconAbsorption(PlainNullEffect):
         )
 
 
-SILICON_MINIMA = 0.4
-"""Distance of neighbouring minima of frames of the sky, in parts of the way from one table of silicon to another."""
-
-
 class SiliconConstants(PlainNullEffect):
     """Index and extinction of all silicon lie on the way from the table of the set-up to another one.
 
@@ -168,10 +164,7 @@ class SiliconConstants(PlainNullEffect):
         Parameter("franta", "", 0.0, (-1.0, 2.0), 0.5, "part of the way to the table of Franta et al."),
         Parameter("schinke", "", 0.0, (-1.0, 2.0), 0.5, "part of the way to the table of Schinke et al."),
     )
-    # Between two tables the fringes of 100 µm move by 0.8 of an order at 960 nm, and by others at other wavelengths.
-    search = SearchHints(
-        refinements={"schinke": 1}, repeats_on_sky={"franta": SILICON_MINIMA, "schinke": SILICON_MINIMA}
-    )
+    search = SearchHints(refinements={"schinke": 1})
 
     def change_system(self, system: OpticalSystem, values: Values) -> OpticalSystem:
         """Move the constants of every layer of silicon."""

@@ -1,7 +1,8 @@
 """Discovery of missing effects: find the disagreement, name it, add it, show the gap shrink."""
 
 from ...model.effects_override import read_effects_override
-from .search import SearchOptions, discover
+from .options import SearchOptions
+from .search import discover
 from .sky_search import SKY_SEARCH, discover_sky, placement_in_frames
 from .verdict import Gap, NamedEffect, ParameterValue, Step, Verdict, Where, probability_text
 

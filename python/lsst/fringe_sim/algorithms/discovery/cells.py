@@ -54,11 +54,6 @@ class CellData:
         return self.geometry.wavelength_nm
 
     @property
-    def n_values(self) -> int:
-        """Number of measured values."""
-        return int(np.count_nonzero(self.weight))
-
-    @property
     def seen(self) -> BoolArray:
         """Cells with data at some wavelength, shape ``(ny, nx)``."""
         return np.asarray((self.weight > 0).any(axis=0))

@@ -13,14 +13,13 @@ from scipy.special import chdtrc, fdtrc, gammaincinv, gammaln
 
 from ...array_types import BoolArray, FloatArray
 from ...effects import AMPLIFIERS, ImageGeometry
-from .fit import Columns, Design, FullColumns, PlaneColumns, Whitener
+from .columns import PlaneColumns
 
 HARMONICS = 3
 BANDS = 8  # Bands of spatial frequency in the test of texture
 SPATIAL_ORDER = 4  # Cosine patterns up to this order along both axes together
 MEDIAN_OF_SQUARE = 2.0 * float(gammaincinv(0.5, 0.5))  # Median of χ² of one degree of freedom
 
-RANK_TOLERANCE = 1e-7
 
 NEAREST_ECHO = 4
 """Cells below which a moved copy of the image is no echo: diffusion and thickness do that as well."""
@@ -34,12 +33,16 @@ REACH = 12.0  # Terms of a mixture by Poisson on both sides of the largest [stan
 class State:
     """A fit with all that the tests need."""
 
-    design: Design  # linearised model at the fit, all nuisances and free effects in it
+    slope: FloatArray  # (W, ny, nx): whitened derivative with respect to thickness
     residual: FloatArray  # (W, ny, nx): whitened residual
     raw_residual: FloatArray  # (W, ny, nx): data minus model, relative; 0 where there are no data
     value: FloatArray  # (W, ny, nx)
     thickness_um: FloatArray  # (ny, nx): fitted field
-    whiten: Whitener
+    root: FloatArray  # (W, ny, nx): one over the standard deviation of the noise; 0 where there are no data
+
+    def whiten(self, values: FloatArray) -> FloatArray:
+        """Differences of cells ``(..., W, ny, nx)`` in units of the noise."""
+        return self.root * values
 
 
 @dataclass(frozen=True)
@@ -54,60 +57,14 @@ class Channel:
     probability: float
 
 
-def project_test(design: Design, columns: Columns, residual: FloatArray) -> tuple[float, int]:
-    """Score statistic of columns with all nuisances projected out, and its degrees of freedom."""
-    score, information = design.project(columns, residual)
-    scale = np.sqrt(np.maximum(np.diag(columns.gram), 1e-300))
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    keep = values > RANK_TOLERANCE
-    along = vectors[:, keep].T @ (score / scale)
-    return float((along**2 / values[keep]).sum()), int(keep.sum())
-
-
 def fringe_phase(thickness_um: FloatArray, wavelength_nm: FloatArray, index: FloatArray) -> FloatArray:
     """Round-trip phase of the varying layer, ``(W, ny, nx)`` [rad]."""
     return (4.0 * np.pi * index / (1e-3 * wavelength_nm))[:, None, None] * thickness_um
 
 
-def measure_channels(
-    state: State,
-    geometry: ImageGeometry,
-    index: FloatArray,
-    imprecision: float = 0.0,
-    correlation: float = 0.0,
-) -> tuple[Channel, ...]:
-    """All tests that need no catalogue.
-
-    ``index`` (W,). ``imprecision``: χ² by which the shape of the fringes may be off because effects that were
-    found are described only so well. ``correlation``: correlation of the noise of neighbouring cells that the
-    effects of the fit account for.
-    """
-    channels = [
-        _feature_channel("thickness phase", phase_features(state, geometry, index), state, imprecision)
-    ]
-    if min(state.thickness_um.shape) >= 8:
-        channels.append(_feature_channel("large scales", spatial_features(state, geometry), state))
-        channels.append(_feature_channel("amplifiers", amplifier_features(state, geometry), state))
-    if min(state.thickness_um.shape) >= 24:
-        channels.extend(texture_channels(state, correlation))
-        channels.append(echo_channel(state))
-    return tuple(channels)
-
-
-def combined_probability(channels: Sequence[Channel]) -> float:
-    """Chance that noise alone gives so small a smallest probability among the channels."""
-    smallest = min((channel.probability for channel in channels), default=1.0)
-    return in_looks(smallest, len(channels))
-
-
 def in_looks(chance: float, looks: float) -> float:
     """Chance that the smallest of so many independent chances is as small (Šidák)."""
     return float(-np.expm1(looks * np.log1p(-min(chance, 1.0 - 1e-16))))
-
-
-def _feature_channel(name: str, columns: Columns, state: State, imprecision: float = 0.0) -> Channel:
-    statistic, degrees = project_test(state.design, columns, state.residual)
-    return Channel(name, statistic, degrees, chance_beyond(statistic, max(degrees, 1), imprecision))
 
 
 def chance_beyond(statistic: float, degrees: float, noncentrality: float = 0.0) -> float:
@@ -141,12 +98,12 @@ def phase_features(state: State, geometry: ImageGeometry, index: FloatArray) -> 
         shapes += [np.cos(phase[plane]) * depth, np.sin(phase[plane]) * depth]
         if half > 0.3:
             shapes += [depth, depth**2]
-        columns += [state.whiten.root[plane] * shape for shape in shapes]
+        columns += [state.root[plane] * shape for shape in shapes]
         planes += [plane] * len(shapes)
-    return PlaneColumns(np.stack(columns), np.array(planes), np.eye(len(planes)), state.whiten)
+    return PlaneColumns(np.stack(columns), np.array(planes), np.eye(len(planes)))
 
 
-def spatial_features(state: State, geometry: ImageGeometry) -> FullColumns:
+def spatial_features(state: State, geometry: ImageGeometry) -> FloatArray:
     """Cosine patterns over the sensor, the same at all wavelengths and in proportion to wavelength."""
     v, u = 0.5 * np.pi * (geometry.v + 1.0), 0.5 * np.pi * (geometry.u + 1.0)
     colour = _colour(geometry.wavelength_nm)
@@ -159,10 +116,10 @@ def spatial_features(state: State, geometry: ImageGeometry) -> FullColumns:
             columns.append(state.whiten(pattern))
             if colour.any():
                 columns.append(state.whiten(pattern * colour))
-    return FullColumns(np.stack(columns))
+    return np.stack(columns)
 
 
-def amplifier_features(state: State, geometry: ImageGeometry) -> FullColumns:
+def amplifier_features(state: State, geometry: ImageGeometry) -> FloatArray:
     """One factor for each amplifier, the same at all wavelengths and in proportion to wavelength."""
     place = geometry.amplifier
     colour = _colour(geometry.wavelength_nm)
@@ -173,7 +130,7 @@ def amplifier_features(state: State, geometry: ImageGeometry) -> FullColumns:
             columns.append(state.whiten(inside))
             if colour.any():
                 columns.append(state.whiten(inside * colour))
-    return FullColumns(np.stack(columns))
+    return np.stack(columns)
 
 
 def texture_channels(state: State, correlation: float = 0.0) -> list[Channel]:
@@ -182,7 +139,7 @@ def texture_channels(state: State, correlation: float = 0.0) -> list[Channel]:
     Power is relative to that of noise whose neighbours are correlated.
     """
     noise = _power_of_noise(state.thickness_um.shape, correlation)
-    used = (state.whiten(np.ones(state.value.shape)) != 0.0).any(axis=0)
+    used = (state.root != 0.0).any(axis=0)
     common = state.residual.sum(axis=0) / np.sqrt(len(state.residual))
     result = []
     shared = dctn(common, norm="ortho") ** 2 / noise
@@ -234,7 +191,7 @@ def echo_channel(state: State) -> Channel:
     Reflections of light along the axis are mirrored about the middle. These three copies have half of the chance to
     themselves: among all distances a faint one is lost.
     """
-    weight = state.whiten(np.ones(state.value.shape))
+    weight = state.root
     pattern = state.value - state.value.mean(axis=(1, 2), keepdims=True)
     scale = np.abs(weight).max(axis=(1, 2), keepdims=True)
     used = (weight != 0.0).astype(float)
@@ -266,7 +223,7 @@ def _largest(groups: Sequence[FloatArray]) -> tuple[float, float]:
 
 def beside_thickness(state: State, whitened: FloatArray) -> FloatArray:
     """Whitened values without what a thickness of its own would explain in each cell."""
-    slope = state.design.slope
+    slope = state.slope
     square = (slope**2).sum(axis=0)
     along = np.divide((slope * whitened).sum(axis=0), square, out=np.zeros(square.shape), where=square > 0.0)
     return np.asarray(whitened - slope * along)

@@ -152,8 +152,7 @@ def _by_wavelength(state: State, phase: FloatArray, geometry: ImageGeometry) -> 
         shapes = [f(h * phase[plane]) for h in (1, 2, 3) for f in (np.cos, np.sin)] + [
             np.ones(phase.shape[1:])
         ]
-        weight = _plane_weight(state, plane)
-        root = np.sqrt(weight)
+        root = state.root[plane]
         columns = np.stack([(root * shape).ravel() for shape in shapes], axis=1)
         data = (root * state.raw_residual[plane]).ravel()
         solution = np.linalg.lstsq(columns, data, rcond=None)[0]
@@ -165,16 +164,9 @@ def _by_wavelength(state: State, phase: FloatArray, geometry: ImageGeometry) -> 
     return rows
 
 
-def _plane_weight(state: State, plane: int) -> FloatArray:
-    unit = np.zeros(state.value.shape)
-    unit[plane] = 1.0
-    weight: FloatArray = (state.whiten(unit) ** 2).sum(axis=0)
-    return weight
-
-
 def _by_amplifier(state: State, geometry: ImageGeometry) -> list[dict[str, Any]]:
     place = geometry.amplifier
-    common = state.whiten(np.ones(state.value.shape))
+    common = state.root
     rows = []
     for number, name in enumerate(AMPLIFIERS):
         inside = place == number
@@ -190,7 +182,7 @@ def _by_amplifier(state: State, geometry: ImageGeometry) -> list[dict[str, Any]]
 def _by_phase(state: State, phase: FloatArray) -> list[dict[str, float]]:
     turn = np.mod(phase / (2.0 * np.pi), 1.0)
     place = np.minimum((turn * PHASE_BINS).astype(int), PHASE_BINS - 1)
-    weight = np.stack([_plane_weight(state, plane) for plane in range(len(phase))])
+    weight = state.root**2
     rows = []
     for number in range(PHASE_BINS):
         inside = place == number
@@ -202,7 +194,7 @@ def _by_phase(state: State, phase: FloatArray) -> list[dict[str, float]]:
 
 
 def _harmonic(state: State, phase: FloatArray, harmonic: int) -> tuple[float, float, float]:
-    weight = np.stack([_plane_weight(state, plane) for plane in range(len(phase))])
+    weight = state.root**2
     total = float(weight.sum())
     cosine = 2.0 * float((weight * state.raw_residual * np.cos(harmonic * phase)).sum()) / total
     sine = 2.0 * float((weight * state.raw_residual * np.sin(harmonic * phase)).sum()) / total

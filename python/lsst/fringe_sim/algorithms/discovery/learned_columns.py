@@ -22,7 +22,7 @@ from ...effects.learned import (
     node_shares,
 )
 from .channels import State
-from .fit import Columns, PlaneColumns
+from .columns import Columns, PlaneColumns
 
 LENGTHS_NM = (1.0, 30.0, 100.0)
 """Correlation lengths over wavelength that are tried [nm]: none at all, some exposures, all of them."""
@@ -78,7 +78,7 @@ class LocalColumns:
         for amplitude, plane in zip(levels.amplitude, levels.plane, strict=True):
             one = np.zeros(self.terms.shape[1:])
             one[plane] = amplitude
-            rows.append(self.dot(levels.whiten.decorrelate(one)))
+            rows.append(self.dot(one))
         return np.asarray((levels.basis.T @ np.stack(rows)).T)
 
 
@@ -158,17 +158,17 @@ def _product(first: FloatArray, second: FloatArray) -> FloatArray:
 
 def _of_phase(fitted: Fitted) -> Family:
     """Harmonics of the fringe at every wavelength."""
-    settings, whiten = fitted.settings, fitted.state.whiten
+    settings = fitted.settings
     nodes, shares = _used_nodes(fitted.geometry.wavelength_nm)
     waves = [f"{wave}{harmonic}" for harmonic in LEARNED_HARMONICS for wave in ("cos", "sin")]
     amplitude, step = [], 1e-3
     for wave in waves:
         names = [f"learned_response.{wave}_{node}" for node in LEARNED_NODES_NM]
         moved = {name: settings.get(name, 0.0) + step for name in names}
-        amplitude.append(whiten.root * fitted.change({**settings, **moved}) / step)
+        amplitude.append(fitted.state.root * fitted.change({**settings, **moved}) / step)
     planes = np.tile(np.arange(len(shares)), len(waves))
     basis = _product(np.eye(len(waves)), shares)
-    columns = PlaneColumns(np.concatenate(amplitude), planes, basis, whiten)
+    columns = PlaneColumns(np.concatenate(amplitude), planes, basis)
     keys = tuple(f"learned_response.{wave}_{node}" for wave in waves for node in nodes)
     priors = []
     for length in LENGTHS_NM:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ...array_types import BoolArray, FloatArray
 from ...effects import ImageGeometry
 from .channels import State
-from .fit import Columns, Projected
+from .columns import Columns, Projected
 from .learned_columns import Family, families
 from .validation import FEWEST_ROWS
 

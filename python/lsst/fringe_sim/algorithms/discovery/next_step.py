@@ -7,11 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from ...effects import Effect
 from ...errors import FringeSimError
-from ...model import FringeModel
-from ..flat_series import LEVEL_E, FlatSeries
-from ..next_measurement import Measurement, RankedMeasurement, break_ambiguity, rank_measurements
+from ..next_measurement import Measurement, RankedMeasurement, break_ambiguity
 from .cells import CellData
 from .verdict import NamedEffect
 
@@ -48,42 +45,6 @@ def with_next_measurements(
         result.append(replace(effect, break_ambiguity=text))
         table += [_row(effect.name, item) for item in ranked]
     return tuple(result), tuple(table)
-
-
-def flats_ranked(
-    effect: NamedEffect,
-    rivals: Values,
-    named: Sequence[NamedEffect],
-    model: FringeModel,
-    cells: CellData,
-    thickness_um: tuple[float, float],
-    catalogue: Sequence[Effect],
-    *,
-    few: bool = False,
-) -> tuple[RankedMeasurement, ...]:
-    """Further flats by how well they tell an effect from others; see `rank_measurements`.
-
-    ``few``: whether the data are a few pixels only: then more of them are a measurement, too.
-    """
-    certain = dict(model.effect_settings)
-    for other in named:
-        if other is not effect:
-            certain |= {f"{other.name}.{key}": p.value for key, p in other.parameters.items()}
-    found = {effect.name: {key: p.value for key, p in effect.parameters.items()}}
-    levels = [level for level in cells.geometry.level_e if math.isfinite(level) and level > 0.0]
-    times = tuple(cells.geometry.dark_time_s.tolist())
-    flats = FlatSeries(
-        tuple(cells.wavelength_nm.tolist()),
-        sum(levels) / len(levels) if levels else LEVEL_E,
-        dark_time_s=times if min(times) > 0.0 else (),
-    )
-    ranked = rank_measurements(
-        model.with_effects(certain, catalogue), {**found, **rivals}, flats,
-        thickness_um=thickness_um, significance=effect.significance, catalogue=catalogue,
-    )  # fmt: skip
-    if few and ranked:
-        ranked = (*ranked, more_pixels(ranked[0], cells))
-    return tuple(sorted(ranked, key=lambda item: -item.separation))
 
 
 def more_pixels(ranked: RankedMeasurement, cells: CellData) -> RankedMeasurement:

@@ -1,15 +1,12 @@
-"""Thresholds and sizes of a search."""
+"""Constants that decide in a search, in one place, with where they come from."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
-from ...errors import OutOfRangeError, UnknownNameError, named_units
+from ...errors import OutOfRangeError, named_units
 from .accuracy import MODEL_ACCURACY
-from .selection import Hypothesis
-
-CORES = ("present", "marginal")  # Searches that there are
 
 
 @named_units
@@ -22,31 +19,48 @@ class SearchOptions:
     most_cells : `int`
         Cells that the data are averaged to, if the pattern allows it.
     significance : `float`
-        Chance of noise below which the unchanged model is held to disagree.
-    consistency : `float`
-        Chance of noise above which a residual is held to be noise.
-    least_evidence : `float`
-        Gain in log evidence that an added effect must bring.
-    class_width : `float`
-        Difference in log evidence within which effects are one class.
+        Chance of noise, of all critics together, below which what is left is no noise.
     least_probability : `float`
         Probability of a class with which it is named.
+    class_width : `float`
+        Difference in log evidence within which sets are one class: odds of 150.
     most_effects : `int`
-        Largest number of effects tried together; three are told, and too many to be named (`outsiders_for_one`).
-    refits : `int`
-        Effects that are refitted in each round, best scores first; twice as many pairs.
-    credit : `float`
-        Log evidence that a set may lack if what it leaves is noise and what the other leaves is not.
-    parents : `int`
-        Sets of nearly equal evidence from which larger ones are made; of single effects all that were refitted, the
-        others by the derivatives of what is added alone.
+        Largest set that is tried; three are told, and too many to be named (`outsiders_for_one`).
     heldout_fraction : `float`
         Part of the sensor that no selection sees.
     outsider_prior : `float`
         Prior probability of a cause that is not in the catalogue.
-    core : {"present", "marginal"}
-        Which search: the present one, or an experimental one on one likelihood, which cannot do everything yet and
-        may change in any version.
+    refits : `int`
+        Groups of effects that are refitted in each round, best scores first.
+    fewest_refits : `int`
+        The same where no score reaches the price of an effect: what derivatives at null do not see. Sets with effects
+        are enlarged by their scores alone.
+    beam : `int`
+        Sets of each size that are enlarged.
+    twin_cosine : `float`
+        Cosine of projected scores from which on two effects are of one group: one explains 0.95² of the other.
+    most_judged : `int`
+        How often noise and slopes are judged again with one effect, as long as another one is the best; with more
+        effects they are judged once.
+    most_turns : `int`
+        Repeats of an effect by which a fit goes on, as long as each brings more.
+    imprecision : `float`
+        Part of what effects explain in which their form may be wrong.
+    precision : `float`
+        Part of the fringes to which cells are described, as the test against pixels shows.
+    phase_error : `float`
+        Error of the thickness of a cell [rad of fringe phase] above which cells are made larger: half of its square
+        is lost of the fringes, and half of that is not in the linear model.
+    cell_phase : `float`
+        Largest phase across a cell [rad] for which they are: three places describe it to 1e-3 of the fringes, which
+        are weak then.
+    least_of_promise : `float`
+        Part of what an effect brings that derivatives promise; sets that cannot come near the best are not fitted,
+        and an effect that brings less is tried from elsewhere. Seen in the fits of four cases of the panel, where all
+        but a few kept within it.
+    sizes : `tuple` [`float`]
+        Departures, in prior scales, at which an effect of one parameter is tried where its linear step does not bring
+        what it promised, and to which its secants reach if it departs to one side or repeats.
     time_budget_s : `float`
         Time on the clock [s] after which the best answer so far is given; as long as it takes by default. A fifth of
         it is kept for the judgement of that answer on the data held out.
@@ -57,19 +71,25 @@ class SearchOptions:
 
     most_cells: int = 20_000
     significance: float = 1e-3
-    consistency: float = 1e-3
-    least_evidence: float = 6.0
-    class_width: float = 5.0
     least_probability: float = 0.95
+    class_width: float = 5.0
     most_effects: int = 3
-    refits: int = 10
-    credit: float = 20.0
-    parents: int = 5
     heldout_fraction: float = 0.25
     outsider_prior: float = 0.15
+    refits: int = 6
+    fewest_refits: int = 2
+    beam: int = 3
+    twin_cosine: float = 0.95
+    most_judged: int = 4
+    most_turns: int = 4
+    imprecision: float = 0.01
+    precision: float = 1e-4
+    phase_error: float = 0.1
+    cell_phase: float = 3.5
+    least_of_promise: float = 0.8
+    sizes: tuple[float, ...] = (0.3, 1.0, 3.0)
     time_budget_s: float = math.inf
     model_accuracy: float = MODEL_ACCURACY
-    core: str = "present"
 
     def __post_init__(self) -> None:
         if not self.time_budget_s > 0.0:
@@ -77,9 +97,7 @@ class SearchOptions:
         if not 0.0 <= self.model_accuracy < 1.0:
             raise OutOfRangeError("model accuracy", self.model_accuracy, "0 or more, below 1")
 
-        if self.core not in CORES:
-            raise UnknownNameError("core", self.core, CORES)
-
-    def is_noise(self, found: Hypothesis) -> bool:
-        """Whether a set leaves what noise may be."""
-        return found.probability_of_noise > self.consistency
+    @property
+    def sure(self) -> float:
+        """Log odds with which something is as probable as what is named."""
+        return math.log(self.least_probability / (1.0 - self.least_probability))

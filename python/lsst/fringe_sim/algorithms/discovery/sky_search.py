@@ -43,7 +43,8 @@ from ..sky_response import (
     white_light,
 )
 from .noise import scatter_of_pixels
-from .search import Report, SearchOptions, search_exposures
+from .options import SearchOptions
+from .search import Report, search_exposures
 from .verdict import Verdict
 
 Grid = tuple[float, float, int]  # First, step [µm] and number of thicknesses
@@ -66,8 +67,8 @@ level above which they scatter by ten times that [e⁻]."""
 
 AIRMASS_RANGE = 0.2  # Largest difference in airmass of frames that are searched together
 
-SKY_SEARCH = SearchOptions(most_effects=2, refits=6, parents=2)
-"""Fewer trials than for flats: each costs seconds, and one pattern does not tell three effects apart."""
+SKY_SEARCH = SearchOptions(most_effects=2)
+"""Smaller sets than of flats: one pattern does not tell three effects apart."""
 
 _KEPT = 16  # Sensors whose reductions are kept: parameters of the sky move while one of them stays
 

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from scipy.special import ndtr
 
 from ...array_types import FloatArray
-from .channels import Channel, State, beside_thickness
+from .channels import Channel
 
 RADII = (3.0, 4.5, 7.0, 10.0, 15.0)
 """Standard deviations of the spots that are looked for [cells]; larger ones are patterns of large scale."""
@@ -27,26 +27,6 @@ DEPTHS = math.log(1e3)
 """Range of the logarithm of the depth that a spot may have: equal chances from 0.01 to 10 per cent."""
 
 
-def spot_channel(state: State, correlation: float = 0.0) -> Channel:
-    """Test of the strongest spot anywhere on the sensor.
-
-    What is in one place is diluted among the patterns of the whole sensor. The chance that noise has a maximum as
-    high is the mean Euler characteristic of a smooth Gaussian field [1]_, added up over the sizes.
-
-    .. [1] Worsley et al. 1996, Human Brain Mapping 4, 58
-    """
-    return SpotScores.of(state, correlation).channel()
-
-
-def log_evidence_of_spots(state: State, correlation: float = 0.0) -> float:
-    """What a few spots would bring if they were in the model: log evidence over that of a fit without them.
-
-    They are added one by one where they bring most, fitted together, and place, size and depth of each integrated by
-    the Laplace approximation: equal chances for every place, for the logarithm of the size and for that of the depth.
-    """
-    return SpotScores.of(state, correlation).evidence()
-
-
 @dataclass(frozen=True, eq=False)
 class SpotScores:
     """Derivative and curvature of the likelihood with respect to the response of every cell.
@@ -56,13 +36,6 @@ class SpotScores:
 
     score: FloatArray
     information: FloatArray
-
-    @classmethod
-    def of(cls, state: State, correlation: float) -> SpotScores:
-        """Those of a state; ``correlation``: of the noise of neighbouring cells."""
-        weighted = beside_thickness(state, state.whiten(state.value))
-        score, information = (state.residual * weighted).sum(axis=0), (weighted**2).sum(axis=0)
-        return cls.beside_level(score, information, correlation)
 
     @classmethod
     def beside_level(cls, score: FloatArray, information: FloatArray, correlation: float) -> SpotScores:

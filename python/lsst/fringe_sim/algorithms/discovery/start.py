@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_closing, median, median_filter, uniform_filter
+from scipy.ndimage import binary_closing, median, uniform_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ...array_types import BoolArray, Float32Array, FloatArray
 from ...compiled import contiguous, kernel, run_shares, subkernel
 from ...model import FringeModel
-from .basis import SplineBasis
 from .cells import CellData
 from .comparison import chi2_with_free_fringes
+from .surface import robust_surface
 
 SEARCH_STEP_UM = 0.01
 HALF_WINDOW_UM = 0.12  # Reach of the search around a neighbour's thickness [µm]; below half a fringe order
@@ -31,11 +31,8 @@ WIDEST_GAP = 4
 in the data across which cells are neighbours [cells]."""
 
 SURFACE_SPACINGS = (16.0, 8.0)
-SURFACE_ROUNDS = 8
 SURFACE_LOSS = 0.999
-MEDIAN_SIDE = 15
-"""Knots of the smooth surface [cells], rounds in which it forgets what lies far from it, the clarity that all cells
-together may lose by it, and the side of the area in which it begins with the median [cells]."""
+"""Knots of the smooth surface [cells], and the clarity that all cells together may lose by it."""
 
 LEVEL_ROUNDS, LEVEL_CELLS = 2, 1000
 """How often levels and thickness follow from each other, and about how many cells are followed for them."""
@@ -175,22 +172,6 @@ def _misfit(template: FloatArray, steps: NDArray[np.int64], cells: CellData) -> 
 
 def _at(template: FloatArray, steps: NDArray[np.int64]) -> FloatArray:
     return template[:, np.clip(steps, 0, template.shape[1] - 1)]
-
-
-def mended_thickness(model: FringeModel, cells: CellData, thickness_um: FloatArray) -> FloatArray:
-    """Thickness with patches in a wrong fringe order taken back, as a better model than the first one shows them.
-
-    ``model``: the model with the effects that are known by now. ``thickness_um`` (ny, nx): thickness so far;
-    returned where no order changes. Returns (ny, nx).
-    """
-    low, template = search_template(model, cells)
-    order, count = order_steps(model, cells), template.shape[1]
-    score = _correlate(template, cells)
-    first = np.clip(np.rint((thickness_um.ravel() - low) / SEARCH_STEP_UM).astype(np.int64), 0, count - 1)
-    best = _mended(score, first, cells, order)
-    turned = np.abs(best - first) > 0.4 * order
-    mended = np.where(turned, low + SEARCH_STEP_UM * best, thickness_um.ravel())
-    return mended.reshape(thickness_um.shape)
 
 
 def search_template(model: FringeModel, cells: CellData) -> tuple[float, FloatArray]:
@@ -439,17 +420,6 @@ def _near_surface(
     away = np.abs(current - middle) > 0.5 * order
     reach = int(HALF_WINDOW_UM / SEARCH_STEP_UM)
     return np.where(away, _nearby_peak(score, middle, reach), current), away
-
-
-def robust_surface(field: FloatArray, seen: BoolArray, spacing: float, order: float) -> FloatArray:
-    """Spline through most cells of a field ``(ny, nx)``; those that lie orders away do not count."""
-    basis = SplineBasis.of_grid((field.shape[0], field.shape[1]), spacing)
-    weight = seen.astype(float)
-    surface = median_filter(field, MEDIAN_SIDE)
-    for _ in range(SURFACE_ROUNDS):
-        departure = (field - surface) / (0.3 * order)
-        surface = basis.expand(basis.fit(field, weight / (1.0 + departure**2) ** 2))
-    return surface
 
 
 def _turns_of_patches(

@@ -11,12 +11,17 @@ from ....array_types import FloatArray
 from ...inference import Columns, Hypothesis, Point, free_columns, solved
 from ..accuracy import ACCURACY_SOURCE, MODEL_ACCURACY, TABLE_STEP_NM
 from ..learned_columns import over_wavelength
+from ..options import SearchOptions
 from .critics import CRITICS, judge, total_chance
-from .rules import Rules
 
 
 def told_accuracy(
-    null: Hypothesis, best: Hypothesis, index: FloatArray, rules: Rules, accuracy: float, chance: float
+    null: Hypothesis,
+    best: Hypothesis,
+    index: FloatArray,
+    rules: SearchOptions,
+    accuracy: float,
+    chance: float,
 ) -> dict[str, Any]:
     """What the model may be wrong by, and what is left to explain then, as `Verdict.accuracy` holds it.
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 
@@ -24,10 +22,10 @@ from ..channels import (
     spatial_features,
     texture_channels,
 )
-from ..fit import PlaneColumns, Whitener
+from ..columns import PlaneColumns
+from ..options import SearchOptions
 from ..spots import SpotScores
 from ..trends import FEWEST_DRAWS, trend_channel
-from .rules import Rules
 
 RANK = 1e-7  # Relative eigenvalue of what nothing else has left
 
@@ -86,11 +84,10 @@ def state_of(point: Point, columns: Columns, known: FloatArray | float = 0.0) ->
     left = point.projected(point.first_residual - columns.combined(step))
     left = left / np.sqrt(np.maximum(point.noise_share, 0.05))
     root = point.root.reshape(shape)
-    flat = Whitener(root, np.zeros(shape), np.zeros(shape[1:]))
     value = (point.value * point.levels[:, np.newaxis]).reshape(shape)
     raw = np.where(root > 0.0, point.problem.data.value.reshape(shape) - value, 0.0)
-    design = cast(Any, SimpleNamespace(slope=point.steep.reshape(shape)))
-    return State(design, left.reshape(shape), raw, value, point.thickness_um.reshape(shape[1:]), flat)
+    steep, thickness = point.steep.reshape(shape), point.thickness_um.reshape(shape[1:])
+    return State(steep, left.reshape(shape), raw, value, thickness, root)
 
 
 PROJECTED = ("thickness phase", "large scales", "amplifiers")
@@ -115,7 +112,7 @@ def _place(judged: Judged) -> list[Channel]:
         return []
     found = []
     for name, features in (("large scales", spatial_features), ("amplifiers", amplifier_features)):
-        columns = features(judged.state, judged.geometry).values
+        columns = features(judged.state, judged.geometry)
         statistic, degrees = judged.family(columns.reshape(*columns.shape[:2], -1))
         found.append(Channel(name, statistic, degrees, chance_beyond(statistic, max(degrees, 1))))
     return found
@@ -193,7 +190,7 @@ def judge(
     found: Hypothesis,
     null: Hypothesis,
     index: FloatArray,
-    rules: Rules,
+    rules: SearchOptions,
     critics: Sequence[Critic] = CRITICS,
     block: Columns | None = None,
 ) -> tuple[Channel, ...]:
@@ -205,7 +202,7 @@ def judge(
     return tuple(channel for critic in critics for channel in critic(judged))
 
 
-def _undescribed(found: Hypothesis, null: Hypothesis, rules: Rules, fall: float = 0.0) -> float:
+def _undescribed(found: Hypothesis, null: Hypothesis, rules: SearchOptions, fall: float = 0.0) -> float:
     """χ² by which the fringes may be described wrongly; ``fall``: what further effects explain."""
     response = found.point.response
     fringes = response - response.mean(axis=1, keepdims=True)
@@ -214,7 +211,7 @@ def _undescribed(found: Hypothesis, null: Hypothesis, rules: Rules, fall: float 
 
 
 def is_out_of_reach(
-    channels: Sequence[Channel], found: Hypothesis, null: Hypothesis, fall: float, rules: Rules
+    channels: Sequence[Channel], found: Hypothesis, null: Hypothesis, fall: float, rules: SearchOptions
 ) -> bool:
     """Whether something is left that is no noise, even if further effects take so much off χ².
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, cast
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
@@ -14,8 +13,8 @@ from ....effects import ImageGeometry
 from ...inference import Data, Hypothesis, Point, Problem, fit, in_best_orders, relaxed
 from ..cells import CellData
 from ..channels import State
+from ..columns import Columns, PlaneColumns, Projected
 from ..continuation import continued
-from ..fit import Columns, PlaneColumns, Projected, Whitener
 from ..learned_columns import with_learned
 from ..learning import Part, judging_cells
 from ..outliers import spoiled_cells
@@ -79,8 +78,7 @@ class CellPart(Part):
         root, value = self._image(point.root), self._image(point.value * point.levels[:, np.newaxis])
         raw = np.where(root > 0.0, self._image(point.problem.data.value) - value, 0.0)
         residual = self._image(point.unbiased_residual)
-        flat = Whitener(root, np.zeros(root.shape), np.zeros(root.shape[1:]))
-        return State(cast(Any, None), residual, raw, value, self._image(point.thickness_um), flat)
+        return State(self._image(point.steep), residual, raw, value, self._image(point.thickness_um), root)
 
     @property
     def chi2(self) -> float:
@@ -143,9 +141,8 @@ class CellPart(Part):
         along = [columns.along(self._image(own)) for own in (point.response, point.steep)]
         cells = point._forward_solved(np.stack([own.reshape(len(own), -1) for own in along], axis=1))
         planes = np.arange(len(point.levels))
-        whiten = self.state.whiten
         design = point.problem.level_design
-        own_levels = PlaneColumns(self._image(point.value * point.root), planes, design, whiten)
+        own_levels = PlaneColumns(self._image(point.value * point.root), planes, design)
         both = ([1, 2], [1, 2])
         cross = columns.against(own_levels) - np.tensordot(cells, levels.cells, axes=both)
         within = np.linalg.solve(point.information(levels, levels), cross.T)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 
 from ...inference import Hypothesis
-from ..classes import outsider_probability
+from ..outsiders import outsider_probability
 from ..verdict import NamedEffect, ParameterValue, probability_text
 from .critics import spots_instead
 from .search import SetSearch
@@ -54,10 +52,9 @@ def name_effects(sets: SetSearch, best: Hypothesis, explained: float, chance: fl
     rules, pool = sets.rules, list(sets.pool.values())
     top = sets.posterior(best)
     weights = np.exp(np.minimum([sets.posterior(one) - top for one in pool], 0.0))
-    like = cast(Any, SimpleNamespace(names=best.effects, probability_of_noise=chance))
     without = {name: sets.without(best, name) for name in best.effects}
     instead = spots_instead(best, without)
-    outsider = outsider_probability(like, rules.outsider_prior, explained, instead)
+    outsider = outsider_probability(len(best.effects), chance, rules.outsider_prior, explained, instead)
     named, doubts, classes = [], [], {}
     for name in best.effects:
         group = classes[name] = _class_of(sets, best, name)

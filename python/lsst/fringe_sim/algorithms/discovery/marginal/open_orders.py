@@ -11,7 +11,7 @@ from .scores import Scored, Scorer
 
 
 def scorer_at(point: Point, base: Hypothesis, sizes: Sequence[float], beside: Point | None = None) -> Scorer:
-    """Scores beside a set at a point; ``sizes``: see `Rules`, ``beside``: see `Scorer`."""
+    """Scores beside a set at a point; ``sizes``: see `SearchOptions`, ``beside``: see `Scorer`."""
     return Scorer(point, free_columns(point, base.items), sizes, beside)
 
 

@@ -27,16 +27,17 @@ from ...inference import (
     with_free_contrast,
 )
 from ..cells import CellData, bin_cube, finest_useful_cell
+from ..checks import are_few
 from ..continuation import continued
 from ..noise import STATED_UNCERTAINTY
+from ..options import SearchOptions
 from ..outliers import spoiled_cells
-from ..preparation import are_few
-from ..start import robust_surface, starting_thickness
+from ..start import starting_thickness
+from ..surface import robust_surface
 from ..validation import BLOCKS_ACROSS, FEWEST_ROWS
 from .known_thickness import as_known, stated_sigma_um, with_error_of_map
 from .neighbour_order import in_order_of_neighbours
 from .noise import is_measured, measured_noise, neighbour_scatter
-from .rules import Rules
 
 MARGIN_UM = 0.8
 """Thickness beyond the first one that tables cover [µm]: effects may move it by some fringe orders."""
@@ -90,8 +91,7 @@ def prepare(
     cube: FringeCube,
     model: FringeModel,
     effects: Sequence[Effect],
-    most_cells: int,
-    rules: Rules,
+    rules: SearchOptions,
     rng: np.random.Generator,
     exposures: Exposures | None = None,
 ) -> Prepared:
@@ -102,7 +102,7 @@ def prepare(
     """
     good = np.asarray((np.asarray(cube.mask) == 0).all(axis=0))
     held = _held_out(good, rules.heldout_fraction, rng)
-    size = finest_useful_cell(_masked(cube, held), most_cells=most_cells)
+    size = finest_useful_cell(_masked(cube, held), most_cells=rules.most_cells)
     prepared = _in_cells(cube, held, size, model, effects, rules, exposures)
     if prepared.problem.known:
         return prepared
@@ -178,7 +178,7 @@ def _in_cells(
     size: int,
     model: FringeModel,
     effects: Sequence[Effect],
-    rules: Rules,
+    rules: SearchOptions,
     exposures: Exposures | None = None,
 ) -> Prepared:
     """The same in cells of so many pixels."""
@@ -222,7 +222,7 @@ def _in_cells(
     return Prepared(cells, unseen, problem, null, factor, point)
 
 
-def _with_likelier_pixels(point: Point, rules: Rules) -> Point:
+def _with_likelier_pixels(point: Point, rules: SearchOptions) -> Point:
     """The same with pixels that see the point in their middle, not all of their area, or the reverse, if likelier."""
     forward = point.problem.forward
     shape = replace(forward.shape, area=not forward.shape.area)
@@ -247,7 +247,7 @@ def _steepest_um(prepared: Prepared) -> float:
     return float(np.quantile(np.hypot(*np.gradient(surface, cells.cell_px)), 0.95))
 
 
-def prepare_again(prepared: Prepared, found: Hypothesis, rules: Rules) -> Prepared:
+def prepare_again(prepared: Prepared, found: Hypothesis, rules: SearchOptions) -> Prepared:
     """Noise, and what pixels see and the thickness does within cells, as judged with effects in the model."""
     point = with_free_contrast(with_common_offset(found.point))
     cells, noise, problem = _judged(prepared.cells, point, rules)
@@ -268,7 +268,7 @@ def prepare_again(prepared: Prepared, found: Hypothesis, rules: Rules) -> Prepar
     )
 
 
-def _judged(cells: CellData, point: Point, rules: Rules) -> tuple[CellData, FloatArray, Problem]:
+def _judged(cells: CellData, point: Point, rules: SearchOptions) -> tuple[CellData, FloatArray, Problem]:
     """Cells with the noise that a fit leaves, its measured over stated deviation, and the problem about the fit."""
     expected = (point.levels[:, np.newaxis] * point.value).reshape(cells.shape)
     cells = cells.with_noise_of(expected)

@@ -23,9 +23,9 @@ from ...inference import (
     solved,
 )
 from ...inference.coordinates import SECANT
+from ..options import SearchOptions
 from .island_places import ROUNDS, covered
 from .pairs import FEW, Joint, Promised
-from .rules import Rules
 from .smooth import beside_smooth
 from .window import Window
 
@@ -113,7 +113,7 @@ class Scorer:
         return Scored(name, best, degrees, step, unit, fall=max(fall, 0.0))
 
 
-def grouped(scored: Sequence[Scored], rules: Rules) -> list[list[Scored]]:
+def grouped(scored: Sequence[Scored], rules: SearchOptions) -> list[list[Scored]]:
     """Twins together, the best first."""
     groups: list[list[Scored]] = []
     for one in scored:

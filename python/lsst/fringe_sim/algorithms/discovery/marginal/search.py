@@ -19,12 +19,12 @@ from ...inference import (
     led,
 )
 from ...inference.marginal import Point
+from ..options import SearchOptions
 from .catalogue import Catalogue
 from .island_places import moved_island
 from .open_orders import best_of_orders, scorer_at
 from .pace import Pace
 from .pairs import Joint, ScoredPair
-from .rules import Rules
 from .scores import Scored, best_gain, grouped, proposed
 from .starts import best_start, part_of, without_keys
 
@@ -38,7 +38,7 @@ class SetSearch:
 
     catalogue: Catalogue
     null: Hypothesis
-    rules: Rules
+    rules: SearchOptions
     say: Callable[[str], None]
     leaves_noise: Callable[[Hypothesis], bool]  # what the critics say
     pool: dict[frozenset[str], Hypothesis] = field(default_factory=dict)

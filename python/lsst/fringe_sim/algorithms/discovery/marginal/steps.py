@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from ....effects.disc_search import find_step
 from ...inference import Hypothesis
-from .rules import Rules
+from ..options import SearchOptions
 from .scores import residuals_of
 from .search import SetSearch
 
 
-def told_of_steps(sets: SetSearch, found: Hypothesis, rules: Rules) -> list[str]:
+def told_of_steps(sets: SetSearch, found: Hypothesis, rules: SearchOptions) -> list[str]:
     """Sentences for a verdict on local effects beside which the thickness of a set steps no more.
 
     That layers do not step is knowledge that no flat holds: only what no thickness of the cells explains counts as

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,13 +16,13 @@ from ...exposures import Exposures
 from ...inference import Hypothesis
 from ...next_measurement import RankedMeasurement
 from ..channels import Channel
+from ..checks import headers_apart
 from ..describe import describe_residual, disagreement
 from ..evaluations import OutOfTimeError, time_limit
 from ..learning import best_evidence, learn
 from ..neighbours import not_replaced
 from ..next_step import Values, with_next_measurements
 from ..options import SearchOptions
-from ..preparation import headers_apart
 from ..verdict import Gap, NamedEffect, Verdict
 from ..verdict_words import METRIC, WITHIN_ACCURACY, chance_text, said_of_left_out
 from .accuracy import told_accuracy
@@ -34,7 +34,6 @@ from .naming import Naming, name_effects
 from .next_flats import FlatForecast
 from .next_frames import FrameForecast
 from .preparation import prepare, prepare_again
-from .rules import Rules
 from .search import SetSearch
 from .steps import told_of_steps
 from .telling import data_of, rms_left, size_of, steps_of
@@ -57,28 +56,21 @@ class MarginalSearch:
         report: Callable[[str], None],
         exposures: Exposures | None = None,
     ) -> None:
-        shared = {field.name for field in fields(Rules)} & {field.name for field in fields(SearchOptions)}
-        # Both searches share what they call by one name, but for the cost of a round.
-        rules = Rules(**{name: getattr(options, name) for name in shared - {"refits"}})
         report("fitting the thickness with the unchanged model")
-        prepared = prepare(cube, model, effects, options.most_cells, rules, rng, exposures)
-        self.prepared, self.model, self.rules, self.report = prepared, model, rules, report
-        self.options, self.rng, self.until = options, rng, math.inf
+        prepared = prepare(cube, model, effects, options, rng, exposures)
+        self.prepared, self.model, self.rules, self.report = prepared, model, options, report
+        self.rng, self.until = rng, math.inf
         # On the sky the errors of the tables are those of the map too.
         self.teaches = exposures is None and not prepared.few
         stack = model.system.stack
         medium = stack.layers[stack.position(model.system.varying)].medium
         wavelength = prepared.cells.wavelength_nm
         self.index = np.real(medium.index(wavelength, model.system.temperature_k))
-        self.notes = [
-            *headers_apart(cube, model),
-            "searched by one likelihood (core marginal)",
-            *prepared.told,
-        ]
+        self.notes = [*headers_apart(cube, model), *prepared.told]
         self._judged_with: list[set[str]] = []
         self._judged: dict[tuple[Hypothesis, Hypothesis], tuple[Channel, ...]] = {}
-        self.catalogue = Catalogue.of(effects, prepared.problem, rules.most_effects)
-        self.sets = SetSearch(self.catalogue, prepared.null, rules, report, self._leaves_noise)
+        self.catalogue = Catalogue.of(effects, prepared.problem, options.most_effects)
+        self.sets = SetSearch(self.catalogue, prepared.null, options, report, self._leaves_noise)
 
     def _leaves_noise(self, found: Hypothesis) -> bool:
         return total_chance(self._channels(found)) > self.rules.significance
@@ -279,7 +271,7 @@ class MarginalSearch:
 
     def _accuracy(self, found: Hypothesis) -> dict[str, Any]:
         """The disagreement beside what the model may be wrong by."""
-        assumed = self.options.model_accuracy
+        assumed = self.rules.model_accuracy
         if not self.teaches or assumed == 0.0:
             return {}
         try:
