@@ -23,6 +23,8 @@ UNSTATED_UM = 0.01  # Error of a thickness map that states none [µm]
 
 BAD_PLANES = mask_bits("BAD", "SAT", "INTRP", "CR", "EDGE", "SUSPECT", "NO_DATA")
 
+FEWEST_TO_HOLD_OUT = 12  # Rows and columns of cells from which on a part of them is held out
+
 
 @dataclass(frozen=True, eq=False)
 class CellData:

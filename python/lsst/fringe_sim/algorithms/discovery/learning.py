@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from ...array_types import BoolArray, FloatArray
 from ...effects import ImageGeometry
+from .cells import FEWEST_TO_HOLD_OUT
 from .channels import State
 from .columns import Columns, Projected
 from .learned_columns import Family, families
-from .validation import FEWEST_ROWS
 
 FALSE_ALARMS = 0.01  # Chance with which noise alone may seem to teach something
 
@@ -268,7 +268,7 @@ def judging_cells(shape: tuple[int, ...]) -> BoolArray:
 
     A pattern over the sensor can be told where it is seen near by, not in the middle of a block without data.
     """
-    if min(shape) < FEWEST_ROWS:
+    if min(shape) < FEWEST_TO_HOLD_OUT:
         return np.zeros(shape, dtype=bool)
     rows, columns = (np.arange(size) // TILE % 2 == 1 for size in shape)
     return np.asarray(rows[:, np.newaxis] & columns)

@@ -17,10 +17,10 @@ from ...products.sky_frame import refuse_noiseless
 from ..exposures import Exposures
 from .checks import check_setup, why_too_poor
 from .evaluations import OutOfTimeError, time_limit
-from .marginal import MarginalSearch
 from .options import SearchOptions
 from .verdict import Gap, Verdict, Where
 from .verdict_words import METRIC
+from .whole_search import WholeSearch
 
 Report = Callable[[str], None]
 
@@ -96,10 +96,10 @@ def search_exposures(
         if poor:
             return _no_answer(model, poor, cube)
         begun, budget = time.monotonic(), chosen.time_budget_s
-        search: MarginalSearch | None = None
+        search: WholeSearch | None = None
         try:
             with time_limit(begun + (1.0 - FOR_JUDGEMENT) * budget):
-                search = MarginalSearch(cube, model, effects, rng, chosen, say, exposures)
+                search = WholeSearch(cube, model, effects, rng, chosen, say, exposures)
                 return search.run()
         except OutOfTimeError:
             say(f"the search is stopped: {budget:g} s were given")

@@ -9,9 +9,9 @@ from scipy import sparse
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize_scalar
 
-from ....array_types import FloatArray
-from ...inference import Point, Problem, kept
-from ..continuation import curvature_of, factorised
+from ...array_types import FloatArray
+from ..inference import Point, Problem, kept
+from .continuation import curvature_of, factorised
 
 STIFFEST = 12.0
 """Largest logarithm of the stiffness of a smooth thickness over the curvature of the likelihood of a cell, on both

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ....array_types import BoolArray, FloatArray
-from ....effects import Effect, Residuals
-from ....errors import OutOfRangeError
-from ...inference import (
+from ...array_types import BoolArray, FloatArray
+from ...effects import Effect, Residuals
+from ...errors import OutOfRangeError
+from ..inference import (
     Columns,
     Coordinate,
     Hypothesis,
@@ -22,9 +22,9 @@ from ...inference import (
     kept,
     solved,
 )
-from ...inference.coordinates import SECANT
-from ..options import SearchOptions
+from ..inference.coordinates import SECANT
 from .island_places import ROUNDS, covered
+from .options import SearchOptions
 from .pairs import FEW, Joint, Promised
 from .smooth import beside_smooth
 from .window import Window

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ....array_types import FloatArray
-from ...inference import Columns, Coordinate, Point
+from ...array_types import FloatArray
+from ..inference import Columns, Coordinate, Point
 
 FEW = 2
 """Parameters of an effect up to which it is scored with another one: more of them explain what many others do."""

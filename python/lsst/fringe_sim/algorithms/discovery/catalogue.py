@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ....effects import Effect
-from ....effects.base import numbered
-from ....errors import InputError
-from ...inference import Coordinate, Forward, Problem, coordinates_of
+from ...effects import Effect
+from ...effects.base import numbered
+from ...errors import InputError
+from ..inference import Coordinate, Forward, Problem, coordinates_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
-from ....array_types import BoolArray, FloatArray
+from ...array_types import BoolArray, FloatArray
 
 SIDE = 5
 """Side of the part about a cell whose median tells the slope [cells]; at a corner of the data a quarter has any."""

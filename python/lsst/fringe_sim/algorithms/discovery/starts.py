@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ....array_types import FloatArray
-from ....errors import OutOfRangeError
-from ...inference import Coordinate, Hypothesis, Point, jumped
+from ...array_types import FloatArray
+from ...errors import OutOfRangeError
+from ..inference import Coordinate, Hypothesis, Point, jumped
 
 
 def best_start(base: Hypothesis, items: tuple[Coordinate, ...], tried: Sequence[FloatArray]) -> Point | None:

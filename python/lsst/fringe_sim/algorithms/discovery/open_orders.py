@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from ....errors import OutOfRangeError
-from ...inference import Coordinate, Hypothesis, Point, free_columns, jumped
+from ...errors import OutOfRangeError
+from ..inference import Coordinate, Hypothesis, Point, free_columns, jumped
 from .scores import Scored, Scorer
 
 

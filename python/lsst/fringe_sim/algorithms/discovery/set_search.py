@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ....array_types import FloatArray
-from ...inference import (
+from ...array_types import FloatArray
+from ..inference import (
     Coordinate,
     Hypothesis,
     fit,
@@ -18,11 +18,11 @@ from ...inference import (
     jumped,
     led,
 )
-from ...inference.marginal import Point
-from ..options import SearchOptions
+from ..inference.marginal import Point
 from .catalogue import Catalogue
 from .island_places import moved_island
 from .open_orders import best_of_orders, scorer_at
+from .options import SearchOptions
 from .pace import Pace
 from .pairs import Joint, ScoredPair
 from .scores import Scored, best_gain, grouped, proposed

@@ -7,12 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ....array_types import BoolArray, FloatArray
-from ....errors import OutOfRangeError
-from ...inference import CellShape, Data, Hypothesis, Point, fit, relaxed
-from ..learning import SIZES, Prior
-from ..validation import FEWEST_WAVELENGTHS
-from ..verdict_words import LEARNED_WORDS
+from ...array_types import BoolArray, FloatArray
+from ...errors import OutOfRangeError
+from ..inference import CellShape, Data, Hypothesis, Point, fit, relaxed
+from .learning import SIZES, Prior
 from .lesson import (
     CellPart,
     data_of,
@@ -24,6 +22,9 @@ from .lesson import (
 )
 from .preparation import Prepared
 from .telling import rms_left
+from .verdict_words import LEARNED_WORDS
+
+FEWEST_WAVELENGTHS = 8  # Wavelengths from which on every fourth is left out at once
 
 ROUNDS = 3
 """How often a stand-in is fitted again about itself, as long as that helps: what it does is hardly linear."""

@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from ....array_types import FloatArray
-from ....effects import ImageGeometry
-from ...inference import Columns, Hypothesis, Point, free_columns, joined, solved
-from ..channels import (
+from ...array_types import FloatArray
+from ...effects import ImageGeometry
+from ..inference import Columns, Hypothesis, Point, free_columns, joined, solved
+from .channels import (
     BANDS,
     Channel,
     State,
@@ -22,10 +22,10 @@ from ..channels import (
     spatial_features,
     texture_channels,
 )
-from ..columns import PlaneColumns
-from ..options import SearchOptions
-from ..spots import SpotScores
-from ..trends import FEWEST_DRAWS, trend_channel
+from .columns import PlaneColumns
+from .options import SearchOptions
+from .spots import SpotScores
+from .trends import FEWEST_DRAWS, trend_channel
 
 RANK = 1e-7  # Relative eigenvalue of what nothing else has left
 

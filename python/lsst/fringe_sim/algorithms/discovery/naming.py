@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...inference import Hypothesis
-from ..outsiders import outsider_probability
-from ..verdict import NamedEffect, ParameterValue, probability_text
+from ..inference import Hypothesis
 from .critics import spots_instead
-from .search import SetSearch
+from .outsiders import outsider_probability
+from .set_search import SetSearch
+from .verdict import NamedEffect, ParameterValue, probability_text
 
 
 @dataclass(frozen=True, eq=False)

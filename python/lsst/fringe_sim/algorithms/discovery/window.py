@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ....array_types import BoolArray, FloatArray
-from ...inference import Data, Point
+from ...array_types import BoolArray, FloatArray
+from ..inference import Data, Point
 
 MARGIN = 1  # Cells about those that are asked for, so that their distance is known
 

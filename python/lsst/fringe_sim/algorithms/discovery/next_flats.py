@@ -1,23 +1,24 @@
 """Which further flats would tell effects apart that a search has left in one class, by its own likelihood.
 
-As for frames of the sky (`..next_frames`): further flats are of the same cells, with the thickness and the response
+As for frames of the sky (`.next_frames`): further flats are of the same cells, with the thickness and the response
 that these have, and with levels of their own. What two effects do differently is taken between their fits, each at
 the thickness that suits it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ....array_types import FloatArray
-from ....errors import InputError
-from ....model import FringeModel
-from ...inference import Data, Forward, Hypothesis, Point, Problem
-from ...next_measurement import (
+from ...array_types import FloatArray
+from ...errors import InputError
+from ...model import FringeModel
+from ..inference import Data, Forward, Hypothesis, Point, Problem, solved
+from ..next_measurement import (
     FlatMeasurement,
     FlatSeries,
     Measurement,
@@ -25,9 +26,8 @@ from ...next_measurement import (
     RankedMeasurement,
     candidate_measurements,
 )
-from ..cells import CellData
-from ..next_frames import pair_of
-from ..next_step import more_pixels
+from .cells import CellData
+from .next_step import more_pixels
 
 MOST_CELLS = 4096  # Cells for which a forecast is made; of more, so many stand for all
 MARGIN_UM = 0.1  # Thickness beyond that of the cells which tables of further flats cover [µm]
@@ -181,3 +181,14 @@ class FlatForecast:
         across = point.information(levels, columns)
         within = np.linalg.solve(point.information(levels, levels), across)
         return np.asarray(point.information(columns, columns) - across.T @ within)
+
+
+def pair_of(information: FloatArray, own: slice) -> tuple[float, float]:
+    """Likeness of the effect and another one, and the standard deviations by which the other fits worse."""
+    difference, tangent = own.start, slice(own.start + 1, own.stop)
+    cross = information[tangent, difference]
+    moved = float(cross @ solved(information[tangent, tangent], cross))
+    left = max(float(information[difference, difference]) - moved, 0.0)
+    strength = float(information[0, 0])
+    likeness = math.sqrt(max(1.0 - left / strength, 0.0)) if strength > 0.0 else math.nan
+    return likeness, math.sqrt(left)

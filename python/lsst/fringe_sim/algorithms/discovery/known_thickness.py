@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ....array_types import FloatArray
-from ...inference import Point, Problem
-from ..cells import UNSTATED_UM, CellData
+from ...array_types import FloatArray
+from ..inference import Point, Problem
+from .cells import UNSTATED_UM, CellData
 
 LEAST_UM = 1e-4  # Error of the best map [µm], as in the present search
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from ....effects.disc_search import find_step
-from ...inference import Hypothesis
-from ..options import SearchOptions
+from ...effects.disc_search import find_step
+from ..inference import Hypothesis
+from .options import SearchOptions
 from .scores import residuals_of
-from .search import SetSearch
+from .set_search import SetSearch
 
 
 def told_of_steps(sets: SetSearch, found: Hypothesis, rules: SearchOptions) -> list[str]:

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ....array_types import BoolArray, FloatArray
-from ....effects import Effect
-from ....model import FringeModel
-from ....products.fringe_cube import FringeCube
-from ....products.mask import mask_bits
-from ...exposures import Exposures
-from ...inference import (
+from ...array_types import BoolArray, FloatArray
+from ...effects import Effect
+from ...model import FringeModel
+from ...products.fringe_cube import FringeCube
+from ...products.mask import mask_bits
+from ..exposures import Exposures
+from ..inference import (
     CellShape,
     Data,
     Forward,
@@ -26,18 +26,18 @@ from ...inference import (
     with_common_offset,
     with_free_contrast,
 )
-from ..cells import CellData, bin_cube, finest_useful_cell
-from ..checks import are_few
-from ..continuation import continued
-from ..noise import STATED_UNCERTAINTY
-from ..options import SearchOptions
-from ..outliers import spoiled_cells
-from ..start import starting_thickness
-from ..surface import robust_surface
-from ..validation import BLOCKS_ACROSS, FEWEST_ROWS
+from .cells import FEWEST_TO_HOLD_OUT, CellData, bin_cube, finest_useful_cell
+from .checks import are_few
+from .continuation import continued
 from .known_thickness import as_known, stated_sigma_um, with_error_of_map
 from .neighbour_order import in_order_of_neighbours
-from .noise import is_measured, measured_noise, neighbour_scatter
+from .noise import STATED_UNCERTAINTY, is_measured, measured_noise, neighbour_scatter
+from .options import SearchOptions
+from .outliers import spoiled_cells
+from .start import starting_thickness
+from .surface import robust_surface
+
+BLOCKS_ACROSS = 8  # Blocks along a side of the sensor that are held out or not
 
 MARGIN_UM = 0.8
 """Thickness beyond the first one that tables cover [µm]: effects may move it by some fringe orders."""
@@ -110,7 +110,7 @@ def prepare(
     # Smaller ones than are needed may be in wrong orders, and tell nothing of larger ones.
     while turn * _thickness_error_um(prepared.free) > rules.phase_error:
         size *= 2
-        if min(cube.shape[1:]) // size < FEWEST_ROWS:
+        if min(cube.shape[1:]) // size < FEWEST_TO_HOLD_OUT:
             break
         larger = _in_cells(cube, held, size, model, effects, rules)
         across = turn * _steepest_um(larger) * size
@@ -158,7 +158,7 @@ def _in_parts(larger: Prepared, smaller: Prepared) -> tuple[FloatArray, CellShap
 def _held_out(good: BoolArray, fraction: float, rng: np.random.Generator) -> BoolArray:
     """Pixels that no selection sees, in blocks; none where the other ``good`` ones would not tell the noise."""
     rows, columns = good.shape
-    side = min(BLOCKS_ACROSS, max(min(good.shape) // FEWEST_ROWS, 3))
+    side = min(BLOCKS_ACROSS, max(min(good.shape) // FEWEST_TO_HOLD_OUT, 3))
     blocks = rng.permutation(side * side).reshape(side, side) < round(fraction * side * side)
     held = blocks[np.ix_(np.arange(rows) * side // rows, np.arange(columns) * side // columns)]
     some = is_measured(good & ~held) and not are_few(good.shape, int(good.sum()))

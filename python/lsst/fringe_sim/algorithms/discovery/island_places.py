@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from ....array_types import BoolArray
-from ....effects import Effect
-from ....errors import OutOfRangeError
-from ...inference import Coordinate, Point, in_best_orders
+from ...array_types import BoolArray
+from ...effects import Effect
+from ...errors import OutOfRangeError
+from ..inference import Coordinate, Point, in_best_orders
 from .window import Window
 
 STRIDES = 1.0, 0.5, 0.25

@@ -9,37 +9,37 @@ from typing import Any
 
 import numpy as np
 
-from ....effects import Effect
-from ....model import FringeModel
-from ....products.fringe_cube import FringeCube
-from ...exposures import Exposures
-from ...inference import Hypothesis
-from ...next_measurement import RankedMeasurement
-from ..channels import Channel
-from ..checks import headers_apart
-from ..describe import describe_residual, disagreement
-from ..evaluations import OutOfTimeError, time_limit
-from ..learning import best_evidence, learn
-from ..neighbours import not_replaced
-from ..next_step import Values, with_next_measurements
-from ..options import SearchOptions
-from ..verdict import Gap, NamedEffect, Verdict
-from ..verdict_words import METRIC, WITHIN_ACCURACY, chance_text, said_of_left_out
+from ...effects import Effect
+from ...model import FringeModel
+from ...products.fringe_cube import FringeCube
+from ..exposures import Exposures
+from ..inference import Hypothesis
+from ..next_measurement import RankedMeasurement
 from .accuracy import told_accuracy
 from .catalogue import Catalogue
+from .channels import Channel
+from .checks import headers_apart
 from .critics import is_out_of_reach, judge, state_of, total_chance
+from .describe import describe_residual, disagreement
+from .evaluations import OutOfTimeError, time_limit
 from .heldout import Unseen, judge_unseen, rms_unseen
+from .learning import best_evidence, learn
 from .lesson import CellLesson, CellPart, in_all_data, with_corrections
 from .naming import Naming, name_effects
+from .neighbours import not_replaced
 from .next_flats import FlatForecast
 from .next_frames import FrameForecast
+from .next_step import Values, with_next_measurements
+from .options import SearchOptions
 from .preparation import prepare, prepare_again
-from .search import SetSearch
+from .set_search import SetSearch
 from .steps import told_of_steps
 from .telling import data_of, rms_left, size_of, steps_of
+from .verdict import Gap, NamedEffect, Verdict
+from .verdict_words import METRIC, WITHIN_ACCURACY, chance_text, said_of_left_out
 
 
-class MarginalSearch:
+class WholeSearch:
     """One search of exposures by one log marginal likelihood, and how its answer is put.
 
     Parameters are those of `search_exposures`; thickness and noise are fitted with the unchanged model when it is

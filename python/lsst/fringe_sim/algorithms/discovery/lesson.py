@@ -8,16 +8,16 @@ from functools import cached_property
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from ....array_types import BoolArray, FloatArray
-from ....effects import ImageGeometry
-from ...inference import Data, Hypothesis, Point, Problem, fit, in_best_orders, relaxed
-from ..cells import CellData
-from ..channels import State
-from ..columns import Columns, PlaneColumns, Projected
-from ..continuation import continued
-from ..learned_columns import with_learned
-from ..learning import Part, judging_cells
-from ..outliers import spoiled_cells
+from ...array_types import BoolArray, FloatArray
+from ...effects import ImageGeometry
+from ..inference import Data, Hypothesis, Point, Problem, fit, in_best_orders, relaxed
+from .cells import CellData
+from .channels import State
+from .columns import Columns, PlaneColumns, Projected
+from .continuation import continued
+from .learned_columns import with_learned
+from .learning import Part, judging_cells
+from .outliers import spoiled_cells
 from .preparation import Prepared, in_shape
 
 
