@@ -43,14 +43,14 @@ MARGIN_UM = 0.8
 """Thickness beyond the first one that tables cover [µm]: effects may move it by some fringe orders."""
 
 OPEN_ORDERS = 6
-"""Fringe orders on both sides in which every fit of a few pixels is tried, as in the present search."""
+"""Fringe orders on both sides in which every fit of a few pixels is tried."""
 
 FIRST_ERROR_UM = 0.004  # Error of the first thickness [µm]: it is one of steps of 0.01
 SURFACE_CELLS = 8.0  # Distance of the knots of the surface whose slope limits the size of cells [cells]
 KNOWN_UM = 1e-6  # Error of a thickness that is known [µm]
 
 NO_SCATTER, FIRST_SCATTER = 1e-6, 0.003
-"""Response scatter that is none, and what it is before it is measured (the prototype's)."""
+"""Response scatter that is none, and what it is before it is measured."""
 
 
 @dataclass(frozen=True, eq=False)
