@@ -36,14 +36,14 @@ def factorised(matrix: sparse.spmatrix) -> SuperLU:
 def curvature_of(rows: int, columns: int) -> sparse.spmatrix:
     """Sum of squares of all second derivatives as a quadratic form in the cells, of every round of a growth."""
     bends = (
-        sparse.kron(differences(rows, 2), sparse.identity(columns)),
-        sparse.kron(sparse.identity(rows), differences(columns, 2)),
-        np.sqrt(2.0) * sparse.kron(differences(rows, 1), differences(columns, 1)),
+        sparse.kron(_differences(rows, 2), sparse.identity(columns)),
+        sparse.kron(sparse.identity(rows), _differences(columns, 2)),
+        np.sqrt(2.0) * sparse.kron(_differences(rows, 1), _differences(columns, 1)),
     )
     return sum(bend.T @ bend for bend in bends)
 
 
-def differences(size: int, order: int) -> sparse.spmatrix:
+def _differences(size: int, order: int) -> sparse.spmatrix:
     """First or second differences of so many values; fewer have none."""
     if size <= order:
         return sparse.csr_matrix((0, size))
