@@ -233,9 +233,7 @@ class SetSearch:
         for found in grown[: self.rules.beam]:
             point, order_um = found.point, found.point.problem.forward.order_um
             starts = [in_whole_orders(point, self.rules.class_width)]
-            starts += [
-                point.moved(point.levels, point.thickness_um + turn * order_um) for turn in (-1.0, 1.0)
-            ]
+            starts += [point.moved(point.levels, point.thickness_um + t * order_um) for t in (-1.0, 1.0)]
             for start in starts:
                 if start is not point:
                     self._keep(self._fit(found.effects, found.items, start))
