@@ -5,19 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
 from ...array_types import FloatArray
-from ..inference import (
-    Coordinate,
-    Hypothesis,
-    fit,
-    in_open_orders,
-    in_whole_orders,
-    jumped,
-    led,
-)
+from ..inference import Coordinate, Hypothesis, fit, in_open_orders, in_whole_orders, jumped, led
 from ..inference.marginal import Point
 from .catalogue import Catalogue
 from .island_places import moved_island
@@ -27,6 +20,7 @@ from .pace import Pace
 from .pairs import Joint, ScoredPair
 from .scores import Scored, best_gain, grouped, proposed
 from .starts import best_start, part_of, without_keys
+from .valleys import in_deepest_valleys, over_valleys
 
 PARTS = 1.0, 0.3
 """Parts of a linear step of several parameters from which they are fitted: the whole may lead too far."""
@@ -50,8 +44,8 @@ class SetSearch:
         self._joints: dict[frozenset[str], list[Joint]] = {}
         self._added_before: set[tuple[frozenset[str], str]] = set()
         self._short: set[tuple[frozenset[str], str]] = set()  # fits that came far behind before
-        # largest part of its promise that an effect brought where it was fitted
-        self._brought: dict[str, float] = {}
+        self._brought: dict[str, float] = {}  # largest part of its promise that an effect brought in a fit
+        self._deepest: set[Hypothesis] = set()  # sets in the best of their valleys
         self._exchanged: set[frozenset[str]] = set()  # sets whose members were left out and exchanged
 
     def posterior(self, found: Hypothesis) -> float:
@@ -98,6 +92,7 @@ class SetSearch:
 
         What it brings else is that cells or parameters lie in other minima, which they may without it.
         """
+        larger = self._in_deepest_valleys(larger)
         if smaller.effects and self._is_surely_better(larger, smaller):
             others = [self._from_thickness(smaller, larger)]
             others += [
@@ -110,6 +105,17 @@ class SetSearch:
                 # It may be what is left of a larger one, with twins that are not fitted.
                 smaller = self._settled(smaller)
         return larger if self._is_surely_better(larger, smaller) else smaller
+
+    def _in_deepest_valleys(self, found: Hypothesis) -> Hypothesis:
+        """A set with its parameters that repeat where they are the best beside all of its effects."""
+        if found not in self._deepest:
+            found = self._keep(in_deepest_valleys(found, partial(self._fit, found.effects, found.items)))
+            self._deepest.add(found)
+        return found
+
+    def over_valleys(self, found: Hypothesis) -> Hypothesis:
+        """A set with the errors of its parameters over all valleys that the data allow."""
+        return over_valleys(found, partial(self._fit, found.effects, found.items), self.rules.class_width)
 
     def _from_thickness(self, found: Hypothesis, other: Hypothesis) -> Hypothesis:
         """A set fitted anew from the thickness of another one."""
@@ -188,8 +194,7 @@ class SetSearch:
         if not self.catalogue.may_leave((name,), found.effects):
             return
         base = self.without(found, name)
-        signatures = {one.name: one.signature for one in self.scores(base)}
-        least = self._least_gain(base, 2)
+        signatures, least = {one.name: one.signature for one in self.scores(base)}, self._least_gain(base, 2)
         joints = self._joints[frozenset(base.effects)]
         pairs = [pair for joint in joints for pair in joint.best_pairs(best_gain, least, (name,))]
         better: list[ScoredPair] = []
@@ -215,8 +220,9 @@ class SetSearch:
 
     def _of_size(self, size: int) -> list[Hypothesis]:
         """All sets of so many effects, best first."""
-        found = [one for one in self.pool.values() if len(one.effects) == size]
-        return sorted(found, key=self.posterior, reverse=True)
+        return sorted(
+            (h for h in self.pool.values() if len(h.effects) == size), key=self.posterior, reverse=True
+        )
 
     def _in_orders(self, size: int) -> list[Hypothesis]:
         """All sets of so many effects, the best of them in other fringe orders too where none leaves noise."""
@@ -227,9 +233,7 @@ class SetSearch:
         for found in grown[: self.rules.beam]:
             point, order_um = found.point, found.point.problem.forward.order_um
             starts = [in_whole_orders(point, self.rules.class_width)]
-            starts += [
-                point.moved(point.levels, point.thickness_um + turn * order_um) for turn in (-1.0, 1.0)
-            ]
+            starts += [point.moved(point.levels, point.thickness_um + t * order_um) for t in (-1.0, 1.0)]
             for start in starts:
                 if start is not point:
                     self._keep(self._fit(found.effects, found.items, start))
