@@ -19,11 +19,8 @@ from .options import SearchOptions
 from .pace import Pace
 from .pairs import Joint, ScoredPair
 from .scores import Scored, best_gain, grouped, proposed
-from .starts import best_start, part_of, without_keys
+from .starts import best_start, linear_start, without_keys
 from .valleys import in_deepest_valleys, over_valleys
-
-PARTS = 1.0, 0.3
-"""Parts of a linear step of several parameters from which they are fitted: the whole may lead too far."""
 
 
 @dataclass(eq=False)
@@ -212,7 +209,7 @@ class SetSearch:
     def _pair_added(self, base: Hypothesis, pair: ScoredPair, names: tuple[str, ...]) -> Hypothesis:
         """The set with two effects more."""
         items = tuple(item for one in pair.names for item in self.catalogue.items[one])
-        start = best_start(base, items, [part_of(items, pair.step, part) for part in PARTS])
+        start = linear_start(base, items, pair.step)
         both = self._fit(names, (*base.items, *items), base.point if start is None else start)
         brings = both.log_evidence - base.log_evidence
         self.say(f"  {'+'.join(names)}: promised {pair.gain:.1f} together, brings {brings:.1f}")
@@ -296,8 +293,6 @@ class SetSearch:
         key = frozenset(base.effects)
         groups = grouped([one for one in self.scores(base) if (key, one.name) not in self._short], self.rules)
         worth = [group for group in groups if group[0].gain > self.catalogue.price]
-        if base.effects and not missing:
-            worth = [group for group in worth if self._may_lead(base, group[0])]
         fewest = 0 if base.effects and not missing else self.rules.fewest_refits
         if base is self.null and base.point.problem.levels_known and not self.leaves_noise(base):
             worth, most = groups, len(groups)  # derivatives in a wrong order promise nothing
@@ -307,7 +302,8 @@ class SetSearch:
         found: dict[str, Hypothesis] = {}
         self.pace.left = min(number, len(groups))
         for group in groups[:number]:
-            if self._may_lead(base, group[0]) or len(found) < fewest or worth is groups:
+            wanted = self._may_lead(base, group[0]) or len(found) < fewest or worth is groups
+            if wanted or (not missing and self._is_underrated(base, group[0])):
                 found[group[0].name] = self._added(base, group[0])
         if not found:
             return
@@ -344,6 +340,18 @@ class SetSearch:
     def _may_lead(self, base: Hypothesis, one: Scored, kept: float = 1.0) -> bool:
         """Whether a set with one effect more comes near the best, if derivatives promise all but a part."""
         return kept * one.gain > self._least_gain(base, 1)
+
+    def _is_underrated(self, base: Hypothesis, one: Scored) -> bool:
+        """Whether an effect explains more at its linear step than derivatives promise, where more than noise is left.
+
+        The fringes of a sensor whose absorption falls grow with every degree: what the fit brings is not known then.
+        """
+        best = max(self.pool.values(), key=self.posterior)
+        if one.start is not None or self.leaves_noise(best):
+            return False
+        start = linear_start(base, self.catalogue.items[one.name], one.step)
+        promised = 0.5 * one.fall / self.rules.least_of_promise
+        return start is not None and base.point.cost - start.cost > promised
 
     def _least_gain(self, base: Hypothesis, number: int) -> float:
         """What so many effects more must promise to come near the best."""
@@ -423,8 +431,7 @@ class SetSearch:
     ) -> Hypothesis:
         """The fit from the linear step; from elsewhere where that does not bring what it promised, or repeats."""
         every = (*base.items, *items)
-        parts = PARTS[:1] if len(items) == 1 else PARTS
-        first = best_start(base, items, [part_of(items, one.step, part) for part in parts])
+        first = linear_start(base, items, one.step)
         found = self._fit(names, every, base.point if first is None else first)
         kept = self._is_kept(base, found, one)
         if len(items) > 1 or (kept and not items[0].repeat):

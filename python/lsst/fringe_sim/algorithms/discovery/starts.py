@@ -10,6 +10,9 @@ from ...array_types import FloatArray
 from ...errors import OutOfRangeError
 from ..inference import Coordinate, Hypothesis, Point, jumped
 
+PARTS = 1.0, 0.3
+"""Parts of a linear step of several parameters from which they are fitted: the whole may lead too far."""
+
 
 def best_start(base: Hypothesis, items: tuple[Coordinate, ...], tried: Sequence[FloatArray]) -> Point | None:
     """The best of other values that is better than none, or nothing."""
@@ -24,9 +27,11 @@ def best_start(base: Hypothesis, items: tuple[Coordinate, ...], tried: Sequence[
     return best
 
 
-def part_of(items: Sequence[Coordinate], step: FloatArray, part: float) -> FloatArray:
-    """Values of parameters after a part of a step from null."""
-    return np.array([item.null for item in items]) + part * step
+def linear_start(base: Hypothesis, items: tuple[Coordinate, ...], step: FloatArray) -> Point | None:
+    """Where a linear step of parameters from null leads, or nothing if that is not better."""
+    parts = PARTS[:1] if len(items) == 1 else PARTS
+    null = np.array([item.null for item in items])
+    return best_start(base, items, [null + part * step for part in parts])
 
 
 def without_keys(point: Point, keys: set[str]) -> Point:
