@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
+from lsst.fringe_sim.algorithms.discovery.fit import FEWEST_ITERATIONS, Problem, coordinates_of, fit_model
+from lsst.fringe_sim.algorithms.discovery.forward import Forward
+from lsst.fringe_sim.algorithms.discovery.selection import PRECISION, Selector, chance_of
 from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.discovery import discover
-from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
 from lsst.fringe_sim.algorithms.discovery.cells import CellData, bin_cube, finest_useful_cell
 from lsst.fringe_sim.algorithms.discovery.channels import Channel, State, echo_channel, measure_channels
-from lsst.fringe_sim.algorithms.discovery.fit import FEWEST_ITERATIONS, Problem, coordinates_of, fit_model
-from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare, prepare_again
-from lsst.fringe_sim.algorithms.discovery.selection import PRECISION, Selector, chance_of
 from lsst.fringe_sim.algorithms.discovery.start import _mend_patches, mended_thickness, starting_thickness
 from lsst.fringe_sim.challenge import sealed_cases
 from lsst.fringe_sim.challenge.sealed_cases import draw_case

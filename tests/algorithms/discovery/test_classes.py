@@ -5,8 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from lsst.fringe_sim.algorithms.discovery.channels import Channel
 from lsst.fringe_sim.algorithms.discovery.classes import (
     EffectClass,
     classes_in_all_data,
@@ -15,6 +13,8 @@ from lsst.fringe_sim.algorithms.discovery.classes import (
 )
 from lsst.fringe_sim.algorithms.discovery.fit import Coordinate, Fit
 from lsst.fringe_sim.algorithms.discovery.selection import Hypothesis
+
+from lsst.fringe_sim.algorithms.discovery.channels import Channel
 
 WIDTH = 5.0
 NEAR, FAR = "contrast_loss", "bandwidth"

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from lsst.fringe_sim.algorithms.discovery.basis import CellBasis
 from lsst.fringe_sim.algorithms.discovery.fit import Design, FullColumns, PlaneColumns, Whitener
 

@@ -4,7 +4,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
 from lsst.fringe_sim.algorithms.discovery.fit import Whitener
 from lsst.fringe_sim.algorithms.discovery.validation import disagreement_size
 

@@ -6,8 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-from lsst.fringe_sim.algorithms.discovery import fit as fit_module
 from lsst.fringe_sim.algorithms.discovery.fit import (
     Coordinate,
     Fit,
@@ -16,6 +14,8 @@ from lsst.fringe_sim.algorithms.discovery.fit import (
     coordinates_of,
     fit_model,
 )
+
+from lsst.fringe_sim.algorithms.discovery import fit as fit_module
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS

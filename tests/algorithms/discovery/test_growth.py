@@ -5,17 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from recorded_cases import recorded_case
-
-from lsst.fringe_sim.algorithms.discovery import discover, preparation
 from lsst.fringe_sim.algorithms.discovery.basis import CellBasis
-from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
-from lsst.fringe_sim.algorithms.discovery.continuation import continued
 from lsst.fringe_sim.algorithms.discovery.fit import Problem, coordinates_of, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.growth import grown_thickness
 from lsst.fringe_sim.algorithms.discovery.selection import Selector
 from lsst.fringe_sim.algorithms.discovery.validation import thickness_starts, whole_thickness
+from recorded_cases import recorded_case
+
+from lsst.fringe_sim.algorithms.discovery import discover, preparation
+from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
+from lsst.fringe_sim.algorithms.discovery.continuation import continued
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.model import FringeModel

@@ -4,10 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-from lsst.fringe_sim.algorithms.discovery import Verdict, discover
 from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
 from lsst.fringe_sim.algorithms.discovery.thickness_steps import best_thickness_step
+
+from lsst.fringe_sim.algorithms.discovery import Verdict, discover
 from lsst.fringe_sim.challenge.sealed_cases import expose
 from lsst.fringe_sim.mock.thickness import random_field
 

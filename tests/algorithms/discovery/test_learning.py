@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
 from lsst.fringe_sim.algorithms.discovery.fit import (
     Fit,
     FullColumns,
@@ -15,6 +14,7 @@ from lsst.fringe_sim.algorithms.discovery.fit import (
     Whitener,
     fit_model,
 )
+
 from lsst.fringe_sim.algorithms.discovery.learned_columns import LocalColumns
 from lsst.fringe_sim.algorithms.discovery.learning import Learned, Prior, judging_cells
 from lsst.fringe_sim.algorithms.discovery.lesson import evidence_of_correction, learned_beside

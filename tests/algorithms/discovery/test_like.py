@@ -5,10 +5,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-from lsst.fringe_sim.algorithms.discovery import SearchOptions, search
 from lsst.fringe_sim.algorithms.discovery.fit import Fit
 from lsst.fringe_sim.algorithms.discovery.selection import Hypothesis
+
+from lsst.fringe_sim.algorithms.discovery import SearchOptions, search
 
 BEST = ("black_coating", "amplifier_gain", "dark_current")
 

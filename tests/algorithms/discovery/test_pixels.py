@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
+from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
+from lsst.fringe_sim.algorithms.discovery.fit import Problem, coordinates_of, fit_model
+from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from scipy.ndimage import map_coordinates
 from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.discovery import discover, preparation
-from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
 from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
-from lsst.fringe_sim.algorithms.discovery.fit import Problem, coordinates_of, fit_model
-from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.mock import random_field

@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from recorded_numbers import Record
-
-from lsst.fringe_sim.algorithms.discovery import SearchOptions, discover
 from lsst.fringe_sim.algorithms.discovery.basis import CellBasis
-from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
 from lsst.fringe_sim.algorithms.discovery.fit import Problem, coordinates_of, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.growth import grown_thickness
 from lsst.fringe_sim.algorithms.discovery.planes import joined_planes
+from recorded_numbers import Record
+
+from lsst.fringe_sim.algorithms.discovery import SearchOptions, discover
+from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS, Effect
 from lsst.fringe_sim.model import FringeModel

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from flat_cubes import relative_flats
-from scipy.ndimage import gaussian_filter
-
 from lsst.fringe_sim.algorithms.discovery.basis import CellBasis
 from lsst.fringe_sim.algorithms.discovery.fit import coordinates_of, fit_model
+from scipy.ndimage import gaussian_filter
+
 from lsst.fringe_sim.algorithms.discovery.preparation import Prepared, prepare
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.model import FringeModel

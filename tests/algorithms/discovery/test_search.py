@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lsst.fringe_sim.algorithms.discovery.basis import RIDGE, CellBasis, SplineBasis
 
 from lsst.fringe_sim.algorithms.discovery import (
     SearchOptions,
@@ -13,7 +14,6 @@ from lsst.fringe_sim.algorithms.discovery import (
     probability_text,
     read_effects_override,
 )
-from lsst.fringe_sim.algorithms.discovery.basis import RIDGE, CellBasis, SplineBasis
 from lsst.fringe_sim.algorithms.discovery.preparation import check_setup, headers_apart
 from lsst.fringe_sim.challenge.sealed_cases import draw_case, expose
 from lsst.fringe_sim.effects import ArCoating, LineTriangle

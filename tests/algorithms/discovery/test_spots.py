@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from flat_cubes import TEN_NM, relative_flats
-from scipy.special import logsumexp
-
-from lsst.fringe_sim.algorithms.discovery import discover
 from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
-from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
-from lsst.fringe_sim.algorithms.discovery.channels import State, beside_thickness
 from lsst.fringe_sim.algorithms.discovery.fit import Problem, fit_model
 from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.selection import Selector
+from scipy.special import logsumexp
+
+from lsst.fringe_sim.algorithms.discovery import discover
+from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
+from lsst.fringe_sim.algorithms.discovery.channels import State, beside_thickness
 from lsst.fringe_sim.algorithms.discovery.spots import DEPTHS, RADII, log_evidence_of_spots, spot_channel
 from lsst.fringe_sim.challenge.sealed_cases import SealedCase, draw_case
 from lsst.fringe_sim.effects import EFFECTS

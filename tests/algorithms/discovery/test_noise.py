@@ -1,11 +1,11 @@
-"""The noise that the search on one likelihood measures, where there is too little to measure it by."""
+"""The noise that a search measures, and where there is too little to measure it by."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.algorithms.discovery.marginal.noise import FEWEST, measured_noise, neighbour_scatter
+from lsst.fringe_sim.algorithms.discovery.noise import FEWEST, measured_noise, neighbour_scatter
 
 
 @pytest.mark.parametrize("shape", [(5, 2, 40), (5, 40, 2), (5, 8, 11), (12, 9, 10)])
