@@ -13,7 +13,7 @@ BUDGET_S = 100.0
 CASE = draw_case("one", np.random.default_rng(31), size=(48, 64), only=["ghost_pedestal"])
 
 
-def stopped(monkeypatch: pytest.MonkeyPatch, line: str, at_s: float, core: str = "present") -> Verdict:
+def stopped(monkeypatch: pytest.MonkeyPatch, line: str, at_s: float) -> Verdict:
     """Verdict of a search whose clock stands still, and jumps once a line is said."""
     clock = {"now": 0.0}
     monkeypatch.setattr(evaluations.time, "monotonic", lambda: clock["now"])
@@ -22,39 +22,21 @@ def stopped(monkeypatch: pytest.MonkeyPatch, line: str, at_s: float, core: str =
         if said.startswith(line):
             clock["now"] = at_s
 
-    options = SearchOptions(time_budget_s=BUDGET_S, core=core)
+    options = SearchOptions(time_budget_s=BUDGET_S)
     return discover(CASE.cube, CASE.setup, rng=np.random.default_rng(0), options=options, report=report)
 
 
-def test_time_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    verdict = stopped(monkeypatch, "fitting the thickness", 2 * BUDGET_S)
+@pytest.mark.parametrize("line", ["fitting the thickness", "chance that noise"])
+def test_time_for_nothing(monkeypatch: pytest.MonkeyPatch, line: str) -> None:
+    verdict = stopped(monkeypatch, line, 2 * BUDGET_S)
     assert (verdict.verdict, verdict.complete) == ("unexplained", False)
     assert verdict.effects == ()
     assert "stopped" in verdict.summary()
 
 
-@pytest.mark.parametrize("line", ["fitting the thickness", "chance that noise"])
-def test_the_new_core_says_that_it_was_stopped(monkeypatch: pytest.MonkeyPatch, line: str) -> None:
-    verdict = stopped(monkeypatch, line, 2 * BUDGET_S, "marginal")
-    assert (verdict.verdict, verdict.complete) == ("unexplained", False)
-    assert verdict.effects == ()
-
-
-@pytest.mark.slow
-def test_the_new_core_judges_the_best_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
-    verdict = stopped(monkeypatch, "best of 1", 0.9 * BUDGET_S, "marginal")
-    assert not verdict.complete
-    assert verdict.gap.heldout_after < verdict.gap.heldout_before
-    (found,) = verdict.effects
-    assert "ghost_pedestal" in {found.name, *found.ambiguous_with}
-    late = stopped(monkeypatch, "best of 1", 2 * BUDGET_S, "marginal")
-    assert (late.verdict, late.complete, late.effects) == ("unexplained", False, ())
-    assert any("not judged" in note for note in late.notes)
-
-
 @pytest.mark.slow
 def test_what_was_not_judged_on_data_held_out_is_not_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    verdict = stopped(monkeypatch, "  with ", 2 * BUDGET_S)
+    verdict = stopped(monkeypatch, "best of 1", 2 * BUDGET_S)
     assert (verdict.verdict, verdict.complete) == ("unexplained", False)
     assert verdict.effects == ()
     assert any("not judged" in note for note in verdict.notes)
@@ -64,7 +46,7 @@ def test_what_was_not_judged_on_data_held_out_is_not_named(monkeypatch: pytest.M
 @pytest.mark.slow
 def test_the_best_so_far_is_judged_on_data_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """The time kept for it suffices, as the clock stands still: the effect has its class, and the search no end."""
-    verdict = stopped(monkeypatch, "  with ghost_pedestal", 0.9 * BUDGET_S)
+    verdict = stopped(monkeypatch, "best of 1", 0.9 * BUDGET_S)
     assert not verdict.complete
     assert verdict.gap.heldout_after < verdict.gap.heldout_before
     (found,) = verdict.effects
