@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lsst.fringe_sim.algorithms.discovery.selection import Selector
+from lsst.fringe_sim.algorithms.discovery.validation import disagreement_size
 
 from lsst.fringe_sim.algorithms.discovery.accuracy import MODEL_ACCURACY, chance_within_accuracy
 from lsst.fringe_sim.algorithms.discovery.options import SearchOptions
 from lsst.fringe_sim.algorithms.discovery.preparation import prepare
-from lsst.fringe_sim.algorithms.discovery.selection import Selector
-from lsst.fringe_sim.algorithms.discovery.validation import disagreement_size
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.errors import OutOfRangeError

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from lsst.fringe_sim.algorithms.discovery.comparison import chi2_with_free_fringes, local_minima
+from lsst.fringe_sim.algorithms.discovery.comparison import chi2_with_free_fringes
 
 
 @pytest.mark.rng("level and contrast of every wavelength are free")
@@ -34,11 +34,3 @@ def test_a_wavelength_without_data_or_without_fringes_says_nothing() -> None:
     weight = np.zeros((2, 4, 5))
     weight[0] = 1.0
     np.testing.assert_allclose(chi2_with_free_fringes(models, value, weight), 0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("values", "places"),
-    [([3.0, 1.0, 2.0, 0.0, 4.0], [1, 3]), ([0.0, 1.0, 2.0], [0]), ([2.0, 1.0, 0.0], [2]), ([1.0], [0])],
-)
-def test_minima_are_places_without_a_lower_neighbour(values, places) -> None:
-    np.testing.assert_array_equal(local_minima(np.array(values)), places)

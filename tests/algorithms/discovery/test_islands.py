@@ -1,167 +1,179 @@
-"""Discs in which a local effect promises most."""
+"""Local effects in a search: several of them, and such as look like a step of the thickness."""
 
-from __future__ import annotations
-
-from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
-from foreign_sky import foreign_map
-from recorded_numbers import Record
+from scipy.interpolate import RectBivariateSpline
 
-from lsst.fringe_sim.algorithms.discovery import islands
-from lsst.fringe_sim.algorithms.discovery.basis import CellBasis, SplineBasis
-from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
-from lsst.fringe_sim.algorithms.discovery.fit import Fit, Problem, coordinates_of, fit_model
-from lsst.fringe_sim.algorithms.discovery.forward import Forward
-from lsst.fringe_sim.algorithms.discovery.preparation import prepare
-from lsst.fringe_sim.algorithms.discovery.selection import Selector
-from lsst.fringe_sim.challenge.sealed_cases import draw_case, expose
-from lsst.fringe_sim.effects import EFFECTS
-from lsst.fringe_sim.effects import disc_search as discs_module
-from lsst.fringe_sim.effects.disc_search import Discs
+from lsst.fringe_sim.algorithms.discovery import critics, discover
+from lsst.fringe_sim.algorithms.discovery.catalogue import Catalogue
+from lsst.fringe_sim.algorithms.discovery.critics import judge, spot_scores
+from lsst.fringe_sim.algorithms.discovery.options import SearchOptions
+from lsst.fringe_sim.algorithms.discovery.smooth import beside_smooth
+from lsst.fringe_sim.algorithms.discovery.window import Window
+from lsst.fringe_sim.algorithms.inference import (
+    CellShape,
+    Data,
+    Forward,
+    Point,
+    Problem,
+    coordinates_of,
+    fit,
+    in_best_orders,
+    relaxed,
+)
+from lsst.fringe_sim.effects import EFFECTS, ImageGeometry, Residuals
+from lsst.fringe_sim.effects.disc_search import find_step
+from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
+from lsst.fringe_sim.products import FlatExposures, FringeCube
 
-SHAPE = (40, 56)
-
-
-def _disc(row: float, column: float, radius: float) -> np.ndarray:
-    y, x = np.indices(SHAPE)
-    return np.hypot(y - row, x - column) <= radius
+WAVELENGTHS = np.linspace(880.0, 990.0, 12)
+ELECTRONS = 20_000.0
+SIDE = 64
 
 
-def test_sums_over_discs_are_those_of_their_cells() -> None:
-    values = np.random.default_rng(3).standard_normal(SHAPE)
-    discs = Discs.of(np.ones(SHAPE, bool))
-    assert discs.radii[0] == discs_module.SMALLEST_RADIUS
-    assert (
-        discs_module.LARGEST_PART * 40 / discs_module.RADIUS_RATIO
-        < discs.radii[-1]
-        <= discs_module.LARGEST_PART * 40
-    )
-    for radius, sums in zip(discs.radii, discs.sums(values), strict=True):
-        for row, column in ((20, 30), (0, 0), (39, 2), (5, 55)):
-            assert sums[row, column] == pytest.approx(values[_disc(row, column, radius)].sum(), abs=1e-9)
+def void(name: str, gap_nm: float, x: float, y: float, radius: float) -> dict[str, float]:
+    """Settings of a void."""
+    return {
+        f"{name}.thickness": gap_nm, f"{name}.centre_x": x, f"{name}.centre_y": y, f"{name}.radius": radius
+    }  # fmt: skip
 
 
-@pytest.mark.parametrize("strength", [0.5, 1.0])
-def test_a_disc_is_found_with_what_it_promises(strength: float) -> None:
-    discs = Discs.of(np.ones(SHAPE, bool))
-    radius = discs.radii[6]
-    own = _disc(18, 33, radius)
-    information = np.full(SHAPE, 2.0)
-    found = discs.best(np.where(own, 2.0 * strength, 0.0), information)
-    assert found[1:] == pytest.approx((18.0, 33.0, radius))
-    assert found[0] == pytest.approx(2.0 * strength**2 * own.sum())
-
-
-def test_what_cannot_be_the_effect_promises_nothing() -> None:
-    """Not where it would have to be its own opposite, and not where hardly any data are."""
-    seen = np.ones(SHAPE, bool)
-    own, information = _disc(18, 47, 5.0), np.full(SHAPE, 2.0)
-    assert Discs.of(seen).best(np.where(own, -2.0, 0.0), information)[0] == pytest.approx(0.0, abs=1e-6)
-    assert Discs.of(seen).best(np.where(own, 2.0, 0.0), information)[0] > 100.0
-    seen[:, 20:] = False
-    found = Discs.of(seen).best(np.where(own, 2.0, 0.0), information)
-    assert found[0] == pytest.approx(0.0, abs=1e-6)
-
-
-def test_a_sensor_too_small_for_discs_has_none() -> None:
-    discs = Discs.of(np.ones((4, 4), bool))
-    assert discs.radii == []
-    assert discs.best(np.ones((4, 4)), np.ones((4, 4)))[0] == 0.0
+def flats_of(rng: np.random.Generator, effects: dict[str, float]) -> FringeCube:
+    """Flats of pixels that see all of their area, with photon noise; the optics are the package's own."""
+    coarse, fine = np.arange(float(SIDE)), (np.arange(3.0 * SIDE) + 0.5) / 3.0 - 0.5
+    thickness = random_field((SIDE, SIDE), rng, mean=float(rng.uniform(13.0, 19.0)), span=1.5)
+    model = FringeModel.from_setup("ts8_e2v", effects)
+    geometry = ImageGeometry((SIDE, SIDE), fine, fine, WAVELENGTHS, np.full(12, ELECTRONS))
+    flats = model.flat_image(RectBivariateSpline(coarse, coarse, thickness)(fine, fine), geometry)
+    flats = flats.reshape(12, SIDE, 3, SIDE, 3).mean(axis=(2, 4))
+    image = rng.poisson(ELECTRONS * flats / flats.mean(axis=(1, 2), keepdims=True)).astype(np.float32)
+    kelvin, width = model.base_system.temperature_k, model.setup.bandwidth_fwhm_nm
+    rows = FlatExposures(WAVELENGTHS, np.full(12, width), np.full(12, kelvin))
+    return FringeCube(image, np.maximum(image, 1.0), np.zeros(image.shape, np.int32), rows, "electron")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "cause", "found"), [("outsider", "stains", False), ("one", "void", True)])
-def test_stains_are_no_islands(kind: str, cause: str, found: bool) -> None:
-    """Along a void they promise much, and the data are farther from one of any size than from none."""
-    case = draw_case(kind, np.random.default_rng([7, 77]).spawn(2)[0], only=[cause])
-    prepared = prepare(case.cube, FringeModel.from_setup(case.setup), EFFECTS, 20_000)
-    problem, null = prepared.problem, prepared.null
-    state = Selector(problem, EFFECTS, null, prepared.index).state(null)
-    (void,) = (effect for effect in EFFECTS if effect.name == "void")
-    coordinates = coordinates_of(void, problem.forward, state.thickness_um)
-    level, _ = problem.amplitudes(null.levels)
-
-    assert bool(islands.island_starts(problem, state, {}, coordinates, level)) == found
-
-
-@pytest.fixture(scope="module")
-def steep() -> tuple[Problem, Fit, np.ndarray]:
-    """A strong void, its fit at the truth, and the true thickness."""
-    rng = np.random.default_rng([3, 9001]).spawn(2)[0]
-    case = draw_case("one", rng, size=(96, 96), only=["void"])
-    cells, truth = bin_cube(case.cube, 1), case.thickness_um
-    limits = (float(truth.min()) - 1.0, float(truth.max()) + 1.0)
-    forward = Forward.of_cells(FringeModel.from_setup(case.setup), EFFECTS, cells, limits)
-    problem = Problem(cells, forward, CellBasis(truth.shape), np.eye(len(cells.value)))
-    (void,) = (effect for effect in EFFECTS if effect.name == "void")
-    own = coordinates_of(void, forward, truth)
-    position = np.array([item.coordinate(case.values[item.key]) for item in own])
-    return problem, fit_model(problem, own, position, truth.ravel(), iterations=0), truth
+def test_two_voids_are_named() -> None:
+    hidden = {"void": (130.0, 20.3, 17.6, 8.2), "void_2": (60.0, 45.0, 44.0, 10.0)}
+    settings = {key: value for name, own in hidden.items() for key, value in void(name, *own).items()}
+    cube = flats_of(np.random.default_rng([4, 3]), settings)
+    verdict = discover(cube, "ts8_e2v", rng=np.random.default_rng(5))
+    assert {effect.name for effect in verdict.effects} == set(hidden), verdict.summary()
+    for effect in verdict.effects:
+        found = effect.parameters
+        for key, true in void("", *hidden[effect.name]).items():
+            own = found[key.removeprefix(".")]
+            assert abs(own.value - true) < 4.0 * own.sigma + 1e-3 * true
 
 
-def test_an_island_that_is_torn_between_orders_is_mended(steep) -> None:
-    problem, fit, truth = steep
-    on = problem.forward.on_islands(fit.settings)
-    right = on & (np.arange(truth.shape[1]) > np.flatnonzero(on.any(axis=0)).mean())
-    torn = np.where(right, truth - problem.order_um, truth)
-    found = islands.mended_on_islands(problem, fit, torn, truth)
-    assert right.sum() > 100
-    assert np.abs(found - truth).max() < 0.5 * problem.order_um
-    assert np.median(np.abs(found - truth)[right]) < 0.02 * problem.order_um
-    np.testing.assert_array_equal(found[~right], truth[~right])
+def point_of(rng: np.random.Generator, step_um: float, stain: float = 0.0) -> Point:
+    """Cells of which each has a thickness of its own, even but for a step on a disc; ``stain``: depth of a spot."""
+    place = np.arange(40.0)
+    y, x = place[:, np.newaxis], place
+    even = 15.0 + 0.02 * x + 0.01 * y + 3e-4 * x * y
+    thickness = even + step_um * (np.hypot(y - 14.0, x - 22.0) < 7.0)
+    geometry = ImageGeometry((40, 40), place, place, WAVELENGTHS, np.full(12, ELECTRONS))
+    limits = float(even.min()) - 0.8, float(even.max()) + 0.8
+    forward = Forward(
+        FringeModel.from_setup("ts8_e2v"), EFFECTS, geometry, CellShape.of_field(even, 1), limits
+    )
+    dark = 1.0 - stain * np.exp(-0.5 * ((y - 25.0) ** 2 + (x - 12.0) ** 2) / 3.0**2)
+    value = dark.ravel() * forward.predict({}, thickness.ravel())[0] + 0.007 * rng.standard_normal((12, 1600))
+    problem = Problem(Data(value, np.full(value.shape, 0.007**-2.0)), forward, even.ravel(), 1e-3)
+    return relaxed(problem.at({}, np.ones(12), even.ravel()), rounds=6)
 
 
-def test_an_island_stays_as_it_is_where_its_order_suits_the_data_better(steep, monkeypatch) -> None:
-    """What is about it may lead to another order."""
-    problem, fit, truth = steep
-    monkeypatch.setattr(islands, "continued", lambda field, known: field - problem.order_um)
-    np.testing.assert_array_equal(islands.mended_on_islands(problem, fit, truth, truth), truth)
+def residuals_of(point: Point) -> Residuals:
+    """What is left of the thickness beside a smooth one, and the same everywhere of the data."""
+    geometry = point.problem.forward.geometry
+    even = np.ones((len(point.value), *geometry.sample_shape))
+    return Residuals(even, even, geometry, *beside_smooth(point))
 
 
-def test_a_void_is_found_and_placed_on_its_island(recorded: Record) -> None:
-    """Beside a thickness of each cell, and beside a smooth one, where it looks like a step."""
-    values = {"void.centre_x": 21.3, "void.centre_y": 16.8, "void.radius": 7.4, "void.thickness": 60.0}
-    rng = np.random.default_rng(21)
-    truth = foreign_map(rng, (36, 40), 14.0, 14.4)
-    cube, _ = expose(truth, values, rng)
-    model, cells = FringeModel.from_setup("ts8_e2v"), bin_cube(cube.take(np.arange(0, len(cube.image), 2)), 1)
-    limits = (float(truth.min()) - 1.0, float(truth.max()) + 1.0)
-    (void,) = catalogue = [effect for effect in EFFECTS if effect.name == "void"]
-    forward = Forward.of_cells(model, catalogue, cells, limits)
-    problem = Problem(cells, forward, CellBasis(truth.shape), np.eye(len(cells.value)))
-    own = coordinates_of(void, forward, truth)
-    right = np.array([item.coordinate(values[item.key]) for item in own])
-    on = forward.on_islands(values)
+@pytest.mark.rng("step of the thickness")
+def test_a_step_of_the_thickness_is_found(rng: np.random.Generator) -> None:
+    step = find_step(residuals_of(point_of(rng, -0.008)))
+    assert step is not None
+    assert np.allclose(step, (14.0, 22.0, 7.0), atol=1.5)
 
-    null = fit_model(problem, (), np.zeros(0), truth.ravel())
-    level, _ = problem.amplitudes(null.levels)
-    selector = Selector(problem, catalogue, null, np.full(len(cells.value), 1.5), generic=False)
-    starts = islands.island_starts(problem, selector.state(null), {}, own, level)
-    place = [number for number, item in enumerate(own) if item.place]
-    assert np.abs(starts[0].position - right)[place].max() < 4.0
 
-    away = right + np.where([item.place for item in own], 0.8, 0.0)
-    placed, thickness = islands.placed_on_island(problem, own, away, truth, level)
-    assert np.abs(placed - right)[place].max() < 0.5
-    assert np.abs(thickness - truth)[on].mean() < 0.01
-    moved = islands.followed_on_island(problem, "void", values, truth + 0.03 * on, level)
-    assert np.abs(moved - truth)[on].mean() < 0.01
-    whole = fit_model(problem, own, right, truth.ravel())
-    unknown = on & (np.indices(truth.shape)[0] % 2 == 0)
-    told = islands.thickness_on_islands(problem, whole, truth + 0.05 * unknown, unknown)
-    assert np.abs(told - truth)[unknown].mean() < 0.01
+@pytest.mark.rng("step of the thickness")
+def test_thin_voids_are_proposed_there(rng: np.random.Generator) -> None:
+    (effect,) = (one for one in EFFECTS if one.name == "void")
+    starts = effect.propose(residuals_of(point_of(rng, -0.008)))
+    assert max(start["thickness"] for start in starts) < 50.0
+    assert np.allclose([start["centre_x"] for start in starts], 22.0, atol=1.5)
 
-    smooth = replace(problem, basis=SplineBasis.of_grid(truth.shape, 8.0))
-    field = smooth.basis.fit(truth, cells.seen.astype(float))
-    beside = fit_model(smooth, (), np.zeros(0), field)
-    selector = Selector(smooth, catalogue, beside, np.full(len(cells.value), 1.5), generic=False)
-    steps = [selector.at_step("void", beside, least) for least in (0.0, 1e9)]
-    assert steps[1] is None
-    start = islands.start_at_step(smooth, selector.state(beside), {}, own)
-    recorded({
-        "starts": starts, "placed": placed, "thickness": thickness, "followed": moved, "told": told,
-        "at a step": None if start is None else start, "fit there": steps[0] and steps[0].fit.settings,
-    })  # fmt: skip
+
+@pytest.mark.rng("no step of the thickness")
+def test_noise_of_the_thickness_has_no_step(rng: np.random.Generator) -> None:
+    assert [find_step(residuals_of(point_of(rng, 0.0))) for _ in range(4)] == [None] * 4
+
+
+@pytest.mark.rng("cells about an island")
+def test_cells_about_an_island_say_what_all_of_them_do(rng: np.random.Generator) -> None:
+    point = point_of(rng, -0.008)
+    geometry = point.problem.forward.geometry
+    covered = np.hypot(geometry.y_px[:, np.newaxis] - 14.0, geometry.x_px - 22.0).ravel() < 8.0
+    settings = void("void", 40.0, 22.0, 14.0, 7.0)
+    whole = in_best_orders(point.moved(point.levels, point.thickness_um, settings), covered, rounds=2)
+    window = Window.about(point, covered)
+    assert 0 < window.inside.sum() < 0.3 * covered.size
+    part = window.point
+    start = part.moved(part.levels, part.thickness_um, settings)
+    own = in_best_orders(start, covered[window.inside], rounds=2)
+    assert part.cost - own.cost == pytest.approx(point.cost - whole.cost, abs=1e-6)
+    assert window.joined(own).thickness_um == pytest.approx(whole.thickness_um, abs=1e-12)
+
+
+@pytest.mark.rng("effects on the image join cells")
+def test_all_cells_are_asked_where_effects_join_them(rng: np.random.Generator) -> None:
+    point = point_of(rng, 0.0)
+    covered = np.zeros(point.thickness_um.size, dtype=bool)
+    covered[:5] = True
+    joined = point.moved(point.levels, point.thickness_um, {"crosstalk.from_left": 0.004})
+    assert Window.about(joined, covered).inside.all()
+    assert not Window.about(point, covered).inside.all()
+
+
+@pytest.mark.rng("second void beside the first")
+def test_the_second_of_an_effect_is_looked_for_beside_the_first(rng: np.random.Generator) -> None:
+    catalogue = Catalogue.of(EFFECTS, point_of(rng, 0.0).problem, 3)
+    assert catalogue.before == {"void_2": "void", "void_3": "void_2"}
+    assert catalogue.may_add("void", ("bandwidth",))
+    assert not catalogue.may_add("void_2", ("bandwidth",))
+    assert catalogue.may_add("void_2", ("void",))
+    assert not catalogue.may_leave(("void",), ("void", "void_2"))
+    assert catalogue.may_leave(("void_2",), ("void", "void_2"))
+    assert catalogue.may_leave(("void", "void_2"), ("void", "void_2", "bandwidth"))
+
+
+@pytest.mark.rng("stain of the core")
+@pytest.mark.parametrize(("depth", "seen"), [(0.0, False), (0.004, True)])
+def test_a_stain_is_seen(rng: np.random.Generator, depth: float, seen: bool) -> None:
+    null = fit((), (), point_of(rng, 0.0, depth))
+    channels = {one.name: one for one in judge(null, null, np.full(12, 1.5), SearchOptions())}
+    assert (channels["spots"].probability < 1e-3) == seen
+    evidence = spot_scores(null).evidence()
+    assert evidence > 5.0 if seen else evidence < 3.0
+
+
+@pytest.mark.rng("trend of the core")
+def test_errors_of_single_exposures_that_follow_a_curve_are_no_draws(rng: np.random.Generator) -> None:
+    forward = point_of(rng, 0.0).problem.forward
+    (effect,) = (one for one in EFFECTS if one.name == "wavelength_jitter")
+    items = coordinates_of(effect, forward)
+    draws, curve = rng.standard_normal(len(items)), np.linspace(-1.0, 1.0, len(items)) ** 3
+    chances = []
+    for values in (draws, curve + 0.02 * draws):
+        found = SimpleNamespace(
+            items=items, values=values, covariance=1e-4 * np.eye(len(items)),
+            point=SimpleNamespace(problem=SimpleNamespace(forward=forward)),
+        )  # fmt: skip
+        (channel,) = critics._trends(cast(critics.Judged, SimpleNamespace(found=found)))
+        chances.append(channel.probability)
+    assert chances[0] > 1e-3 > chances[1]

@@ -1,26 +1,13 @@
 """What no effect explains is learned, judged by other cells, and noise teaches nothing."""
 
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.algorithms.discovery.fit import (
-    Fit,
-    FullColumns,
-    PlaneColumns,
-    Problem,
-    Whitener,
-    fit_model,
-)
-from lsst.fringe_sim.algorithms.discovery.learned_columns import LocalColumns
-from lsst.fringe_sim.algorithms.discovery.learning import Learned, Prior, judging_cells
-from lsst.fringe_sim.algorithms.discovery.lesson import evidence_of_correction, learned_beside
-from lsst.fringe_sim.algorithms.discovery.preparation import prepare
+from lsst.fringe_sim.algorithms.discovery.learning import Prior
 from lsst.fringe_sim.algorithms.discovery.skeleton import effect_skeleton
-from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import (
     EFFECTS,
     LEARNED,
@@ -32,23 +19,6 @@ from lsst.fringe_sim.effects import (
 from lsst.fringe_sim.model import FringeModel
 
 LEAST = 6.0
-
-
-@pytest.mark.rng("local columns")
-def test_columns_that_are_products_are_those_written_out(rng: np.random.Generator) -> None:
-    shape = (3, 4, 5)
-    direction = rng.uniform(0.5, 1.5, shape)
-    whiten = Whitener(rng.uniform(0.5, 1.5, shape), direction, 0.1 / (direction**2).sum(axis=0))
-    local = LocalColumns(rng.standard_normal((2, 4, 5)), rng.standard_normal((2, *shape)))
-    full = FullColumns(
-        (local.terms[:, np.newaxis] * local.patterns[np.newaxis, :, np.newaxis]).reshape(-1, *shape)
-    )
-    levels = PlaneColumns(rng.standard_normal(shape), np.arange(3), rng.standard_normal((3, 2)), whiten)
-    values = rng.standard_normal((6, *shape))
-    assert local.dot(values) == pytest.approx(full.dot(values))
-    assert local.along(values[0]) == pytest.approx(full.along(values[0]))
-    assert local.gram == pytest.approx(full.gram)
-    assert local.against(levels) == pytest.approx(full.against(levels))
 
 
 @pytest.mark.rng("marginal likelihood")
@@ -63,74 +33,6 @@ def test_evidence_is_that_of_gaussians(rng: np.random.Generator) -> None:
     assert evidence == pytest.approx(known + 0.5 * data @ data)
     expected = size[0] ** 2 * root @ root.T @ columns.T @ np.linalg.solve(covariance, data)
     assert prior.parameters((columns.T @ data)[np.newaxis], size)[0] == pytest.approx(expected)
-
-
-def problem_of(seed: int, outsider: str = "") -> tuple[Problem, Fit]:
-    """Cells of a small sensor, and the fit of the unchanged model."""
-    kind = "outsider" if outsider else "none"
-    only = [outsider] if outsider else None
-    for number in range(seed, seed + 1000):
-        case = draw_case(kind, np.random.default_rng(number), size=(48, 48), only=only)
-        if not outsider or case.values[f"{outsider}.size"] > 0.004:
-            break
-    own = [effect for effect in EFFECTS if not effect.sky_only]
-    prepared = prepare(case.cube, FringeModel.from_setup(case.setup), own, 20_000)
-    return prepared.problem, prepared.null
-
-
-def learned_from(problem: Problem, null: Fit) -> Learned | None:
-    nowhere = np.zeros(problem.cells.shape[1:], dtype=bool)
-    return learned_beside(problem, null, null, nowhere, np.random.default_rng(1), LEAST)
-
-
-@pytest.fixture(scope="module")
-def wandering() -> tuple[Problem, Fit, Learned]:
-    problem, null = problem_of(11, "wandering_light")
-    found = learned_from(problem, null)
-    assert found is not None
-    return problem, null, found
-
-
-@pytest.mark.slow
-def test_light_that_wanders_is_learned(wandering: tuple[Problem, Fit, Learned]) -> None:
-    """More than half of the variance beyond noise is gone in cells that took no part; all cells say more."""
-    problem, null, found = wandering
-    assert evidence_of_correction(problem, null) > found.log_evidence > LEAST
-    assert found.name == "learned_light"
-    assert found.believed
-    floor = found.noise_floor**2
-    assert found.after_rms**2 - floor < 0.5 * (found.before_rms**2 - floor)
-
-
-@pytest.mark.slow
-def test_cells_that_judge_teach_nothing(wandering: tuple[Problem, Fit, Learned]) -> None:
-    """What is planted in them alone moves no parameter, and the correction fares worse."""
-    problem, null, found = wandering
-    cells = problem.cells
-    planted = np.where(judging_cells(cells.shape[1:]), 1.01 + 0.01 * np.sign(np.arange(48) - 20.0), 1.0)
-    other = learned_from(problem.with_cells(replace(cells, value=cells.value * planted)), null)
-    assert other is not None
-    assert other.own == found.own
-    assert other.heldout_gain != pytest.approx(found.heldout_gain, rel=0.01)
-
-
-@pytest.mark.slow
-def test_noise_teaches_nothing() -> None:
-    """Neither that of the frames nor fresh draws on the fitted model."""
-    problem, null = problem_of(5)
-    cells, expected = problem.cells, problem.expected_of(null)
-    sigma = np.divide(1.0, np.sqrt(cells.weight), out=np.zeros(cells.shape), where=cells.weight > 0.0)
-    believed = []
-    for seed in range(4):
-        if seed:
-            noise = np.random.default_rng(seed).standard_normal((2, *cells.shape))
-            value = expected * (1.0 + cells.response_scatter * noise[1, 0]) + sigma * noise[0]
-            fresh = problem.with_cells(replace(cells, value=value))
-            found = learned_from(fresh, fit_model(fresh, (), np.zeros(0), null.field, null.levels))
-        else:
-            found = learned_from(problem, null)
-        believed.append(found is not None and found.believed)
-    assert believed == [False] * 4
 
 
 @pytest.mark.parametrize("name", ["learned_response", "learned_map"])

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lsst.fringe_sim.algorithms.discovery.basis import CellBasis
+from lsst.fringe_sim.algorithms.discovery.fit import Coordinate, Fit, Problem, coordinates_of, fit_model
+from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from sky_frames import sky_frames_of
 
 from lsst.fringe_sim.algorithms.discovery import discover_sky
-from lsst.fringe_sim.algorithms.discovery.basis import CellBasis
 from lsst.fringe_sim.algorithms.discovery.cells import CellData
-from lsst.fringe_sim.algorithms.discovery.fit import Coordinate, Fit, Problem, coordinates_of, fit_model
-from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.discovery.next_frames import FrameForecast, laboratory_of
 from lsst.fringe_sim.algorithms.discovery.sky_search import SKY_SEARCH, SkyExposures
 from lsst.fringe_sim.algorithms.sky_response import bandpass_of

@@ -1,16 +1,14 @@
-"""Which flats to take next, beside flats of many pixels and of one."""
+"""Which data to take next where a class is left, and where there are only a few pixels."""
 
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.algorithms.discovery import next_step
 from lsst.fringe_sim.algorithms.discovery.cells import CellData
-from lsst.fringe_sim.algorithms.discovery.next_step import flats_ranked, with_next_measurements
+from lsst.fringe_sim.algorithms.discovery.next_step import more_pixels, with_next_measurements
 from lsst.fringe_sim.algorithms.discovery.verdict import NamedEffect, ParameterValue
-from lsst.fringe_sim.algorithms.next_measurement import RankedMeasurement
-from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
+from lsst.fringe_sim.algorithms.next_measurement import Measurement, PairForecast, RankedMeasurement
+from lsst.fringe_sim.effects import ImageGeometry
 from lsst.fringe_sim.errors import InputError
-from lsst.fringe_sim.model import FringeModel
 
 FLATS = np.linspace(885.0, 985.0, 5)
 RIVALS = {"roughness": {"sigma": 60.0}}
@@ -28,26 +26,34 @@ def cells_of(side: int) -> CellData:
     return CellData(np.ones(shape), np.full(shape, 2e4), geometry, 1)
 
 
-@pytest.fixture(scope="module")
-def usual() -> tuple[RankedMeasurement, ...]:
-    """What is asked of flats of many pixels."""
-    effect, model = named("roughness"), FringeModel.from_setup("ts8_e2v")
-    return flats_ranked(effect, RIVALS, [effect], model, cells_of(6), (13.0, 14.0), EFFECTS)
+def ranked(name: str, *separations: float) -> RankedMeasurement:
+    """A forecast for pairs that stand apart by one standard deviation more each now, and by so many then."""
+    pairs = [
+        PairForecast("contrast_loss", f"rival {number}", 0.9, 0.8, 1.0 + number, after)
+        for number, after in enumerate(separations)
+    ]
+    return RankedMeasurement(Measurement(name, f"all of {name}"), tuple(pairs))
 
 
 @pytest.mark.parametrize(("side", "gain"), [(1, 100.0), (4, 25.0), (200, 1.0)])
-def test_of_a_few_pixels_more_are_a_measurement(
-    usual: tuple[RankedMeasurement, ...], side: int, gain: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    effect, model = named("roughness"), FringeModel.from_setup("ts8_e2v")
-    monkeypatch.setattr(next_step, "rank_measurements", lambda *args, **options: usual)
-    few = flats_ranked(effect, RIVALS, [effect], model, cells_of(side), (13.0, 14.0), EFFECTS, few=True)
-    (more,) = (item for item in few if item.measurement.name == "more_pixels")
-    assert len(few) == len(usual) + 1
-    assert [item.separation for item in few] == sorted((item.separation for item in few), reverse=True)
-    assert more.separation == pytest.approx(gain * usual[0].pairs[0].separation_now)
-    assert more.pairs[0].likeness_after == more.pairs[0].likeness_now
-    assert more.measurement.title == "the same 5 flats of 100 x 100 pixels"
+def test_the_same_of_many_pixels_knows_as_much_more_as_they_are_more(side: int, gain: float) -> None:
+    more = more_pixels(ranked("repeat", 2.0, 3.0), cells_of(side))
+    assert more.measurement == Measurement("more_pixels", "the same 5 flats of 100 x 100 pixels")
+    assert [pair.separation_after for pair in more.pairs] == pytest.approx([gain, 2.0 * gain])
+    assert [pair.separation_now for pair in more.pairs] == [1.0, 2.0]
+    assert all(pair.likeness_after == pair.likeness_now for pair in more.pairs)
+    assert more.separation == pytest.approx(gain)
+
+
+def test_what_decides_is_told_of_an_effect_in_a_class() -> None:
+    forecast = (ranked("repeat", 9.0), ranked("level", 1.0))
+    effects, rows = with_next_measurements(
+        [named("roughness")], {"contrast_loss": RIVALS}, lambda effect, rivals: forecast, lambda text: None
+    )
+    assert "all of repeat" in effects[0].break_ambiguity
+    assert [(row["effect"], row["measurement"], row["separation_sigma"]) for row in rows] == [
+        ("contrast_loss", "repeat", 9.0), ("contrast_loss", "level", 1.0)
+    ]  # fmt: skip
 
 
 def test_effects_that_are_alone_ask_for_nothing() -> None:

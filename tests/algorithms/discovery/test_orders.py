@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lsst.fringe_sim.algorithms.discovery.classes import classes_of
+from lsst.fringe_sim.algorithms.discovery.fit import Fit, Problem, fit_model
+from lsst.fringe_sim.algorithms.discovery.orders import fields_in_other_orders
+from lsst.fringe_sim.algorithms.discovery.selection import Hypothesis, Selector
 from recorded_cases import recorded_case
 from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions
-from lsst.fringe_sim.algorithms.discovery.classes import classes_of
-from lsst.fringe_sim.algorithms.discovery.fit import Fit, Problem, fit_model
-from lsst.fringe_sim.algorithms.discovery.orders import fields_in_other_orders
 from lsst.fringe_sim.algorithms.discovery.preparation import Prepared, prepare, prepare_again
-from lsst.fringe_sim.algorithms.discovery.selection import Hypothesis, Selector
 from lsst.fringe_sim.algorithms.discovery.set_search import SetSearch
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS

@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 from recorded_numbers import Record
 
-from lsst.fringe_sim.algorithms.discovery import SearchOptions, discover
-from lsst.fringe_sim.algorithms.discovery.basis import CellBasis
-from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
-from lsst.fringe_sim.algorithms.discovery.fit import Problem, coordinates_of, fit_model
-from lsst.fringe_sim.algorithms.discovery.forward import Forward
-from lsst.fringe_sim.algorithms.discovery.growth import grown_thickness
-from lsst.fringe_sim.algorithms.discovery.planes import joined_planes
+from lsst.fringe_sim.algorithms.discovery import discover
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS, Effect
-from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FringeCube
 
 
@@ -61,26 +54,7 @@ def test_a_search_where_the_thickness_is_known_is_as_recorded(recorded: Record) 
     recorded(discover(cube, case.setup, catalogue("roughness", "tilt"), rng=np.random.default_rng(0)))
 
 
-def test_a_search_of_the_other_core_is_as_recorded(recorded: Record) -> None:
+def test_a_search_of_all_flats_is_as_recorded(recorded: Record) -> None:
     case = draw_case("one", np.random.default_rng(31), size=(24, 28), only=["ghost_pedestal"])
-    known, options = catalogue("ghost_pedestal", "roughness"), SearchOptions(core="marginal")
-    recorded(discover(case.cube, case.setup, known, rng=np.random.default_rng(0), options=options))
-
-
-def test_planes_and_a_thickness_that_grows_are_as_recorded(recorded: Record) -> None:
-    """Where some cells have lost their order, from noisy flats and from behind a blur."""
-    case = draw_case("one", np.random.default_rng(33), size=(24, 32), only=["charge_diffusion"])
-    truth, model = case.thickness_um, FringeModel.from_setup(case.setup)
-    cells = bin_cube(halved(case.cube), 1)
-    order = float(model.fringe_order_um(float(np.median(cells.wavelength_nm))))
-    torn = truth + order * (np.indices(truth.shape)[1] > 22)
-    forward = Forward.of_cells(model, EFFECTS, cells, (float(truth.min()) - 1.0, float(truth.max()) + 1.0))
-    problem = Problem(cells, forward, CellBasis(truth.shape), np.eye(len(cells.value)))
-    (blur,) = catalogue("charge_diffusion")
-    own = coordinates_of(blur, forward, torn)
-    position = np.array([own[0].coordinate(case.values["charge_diffusion.sigma"])])
-    grown = grown_thickness(problem, fit_model(problem, own, position, torn.ravel()), torn)
-    recorded({
-        "planes": joined_planes(model, cells, torn),
-        "grown": None if grown is None else {"thickness": grown.thickness_um, "settings": grown.settings},
-    })  # fmt: skip
+    known = catalogue("ghost_pedestal", "roughness")
+    recorded(discover(case.cube, case.setup, known, rng=np.random.default_rng(0)))

@@ -13,8 +13,7 @@ from lsst.fringe_sim.algorithms.discovery import (
     probability_text,
     read_effects_override,
 )
-from lsst.fringe_sim.algorithms.discovery.basis import RIDGE, CellBasis, SplineBasis
-from lsst.fringe_sim.algorithms.discovery.preparation import check_setup, headers_apart
+from lsst.fringe_sim.algorithms.discovery.checks import check_setup, headers_apart
 from lsst.fringe_sim.challenge.sealed_cases import draw_case, expose
 from lsst.fringe_sim.effects import ArCoating, LineTriangle
 from lsst.fringe_sim.errors import InputError
@@ -24,48 +23,6 @@ from lsst.fringe_sim.products.fringe_cube import FringeCube
 
 SIZE = (48, 64)
 MODEL = FringeModel.from_setup("ts8_e2v")
-
-
-def test_banded_normal_matrix_is_the_dense_one() -> None:
-    rng = np.random.default_rng(1)
-    basis = SplineBasis.of_grid((20, 26), 4.0)
-    curvature = rng.random((20, 26))
-    dense = np.einsum("ya,xb->yxab", basis.along_y, basis.along_x).reshape(520, -1)
-    normal = dense.T @ (curvature.ravel()[:, None] * dense)
-    normal += np.eye(len(normal)) * RIDGE * normal.diagonal().max()
-    right = rng.random((basis.size, 3))
-    np.testing.assert_allclose(
-        basis.normal_matrix(curvature).solve(right), np.linalg.solve(normal, right), rtol=1e-5, atol=1e-6
-    )
-
-
-def test_splines_of_any_number_of_cells() -> None:
-    """They sum to 1 at every cell, also where rounding puts the last knot before the last cell."""
-    for rows in range(1, 130):
-        for spacing in (2.0, 4.0, 8.0):
-            along = SplineBasis.of_grid((rows, 2), spacing).along_y
-            np.testing.assert_allclose(along.sum(axis=1), 1.0, rtol=1e-12)
-
-
-@pytest.mark.parametrize("spacing", [8.0, 4.0])
-def test_a_field_goes_on_where_it_has_no_weight(spacing: float) -> None:
-    """At its rim it would have any slope, and pixels there would average over fringes that are not there."""
-    y, x = np.indices((96, 96))
-    field = 14.0 + 0.02 * x + 0.3 * np.sin(y / 20.0)
-    seen = np.ones(field.shape)
-    seen[24:48, 40:64] = seen[:, 80:] = 0.0
-    basis = SplineBasis.of_grid(field.shape, spacing)
-    fitted = basis.expand(basis.fit(np.where(seen > 0.0, field, 0.0), seen))
-    assert np.abs(fitted - field)[seen > 0.0].max() < 1e-3
-    assert np.abs(fitted - field)[:, :80].max() < 0.1
-    assert np.abs(fitted - field).max() < 0.5
-    np.testing.assert_allclose(basis.expand(basis.fit(np.full((96, 96), 15.0), seen)), 15.0, rtol=1e-9)
-
-
-@pytest.mark.rng("cells that are not seen keep their thickness")
-def test_cells_that_are_not_seen_keep_their_thickness(rng: np.random.Generator) -> None:
-    field, basis = 12.0 + rng.random((5, 7)), CellBasis((5, 7))
-    np.testing.assert_array_equal(basis.expand(basis.fit(field, rng.integers(0, 2, (5, 7)) * 1.0)), field)
 
 
 @pytest.mark.slow

@@ -8,32 +8,29 @@ from flat_cubes import TEN_NM, relative_flats
 from scipy.special import logsumexp
 
 from lsst.fringe_sim.algorithms.discovery import discover
-from lsst.fringe_sim.algorithms.discovery.basis import SplineBasis
 from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
-from lsst.fringe_sim.algorithms.discovery.channels import State, beside_thickness
-from lsst.fringe_sim.algorithms.discovery.fit import Problem, fit_model
-from lsst.fringe_sim.algorithms.discovery.forward import Forward
-from lsst.fringe_sim.algorithms.discovery.selection import Selector
-from lsst.fringe_sim.algorithms.discovery.spots import DEPTHS, RADII, log_evidence_of_spots, spot_channel
+from lsst.fringe_sim.algorithms.discovery.critics import spot_scores
+from lsst.fringe_sim.algorithms.discovery.lesson import data_of
+from lsst.fringe_sim.algorithms.discovery.spots import DEPTHS, RADII, SpotScores
+from lsst.fringe_sim.algorithms.inference import CellShape, Data, Forward, Hypothesis, Problem, fit
 from lsst.fringe_sim.challenge.sealed_cases import SealedCase, draw_case
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.model import FringeModel
 
 SHAPE = (40, 48)
+NOISE = 0.002
 
 
 @pytest.fixture(scope="module")
-def state() -> State:
+def null() -> Hypothesis:
     """A sensor of known thickness, fitted."""
     v, u = np.mgrid[-1.0 : 1.0 : SHAPE[0] * 1j, -1.0 : 1.0 : SHAPE[1] * 1j]
     truth = 15.0 + 0.5 * u - 0.4 * v + 0.3 * u * v
     model = FringeModel.from_setup("ts8_e2v")
-    cells = bin_cube(relative_flats(truth, model, np.random.default_rng(5)), 1)
-    forward = Forward.of_cells(model, EFFECTS, cells, (12.0, 18.0))
-    basis = SplineBasis.of_grid(SHAPE, 4.0)
-    problem = Problem(cells, forward, basis, np.eye(len(TEN_NM)))
-    null = fit_model(problem, (), np.zeros(0), basis.fit(truth, np.ones(SHAPE)))
-    return Selector(problem, EFFECTS[:1], null, np.full(len(TEN_NM), 1.6)).state(null)
+    cells = bin_cube(relative_flats(truth, model, np.random.default_rng(5), NOISE), 1)
+    forward = Forward(model, EFFECTS, cells.geometry, CellShape.of_field(truth, 1, area=False), (12.0, 18.0))
+    problem = Problem(data_of(cells), forward, truth.ravel(), 1e-6)
+    return fit((), (), problem.at({}, np.ones(len(TEN_NM)), truth.ravel()))
 
 
 def _round(y: float, x: float, radius: float) -> np.ndarray:
@@ -41,29 +38,29 @@ def _round(y: float, x: float, radius: float) -> np.ndarray:
     return np.exp(-0.5 * ((rows - y) ** 2 + (columns - x) ** 2) / radius**2)
 
 
-def _with(state: State, response: np.ndarray, noise: np.ndarray) -> State:
+def _noise(rng: np.random.Generator) -> np.ndarray:
+    return NOISE * rng.standard_normal((len(TEN_NM), SHAPE[0] * SHAPE[1]))
+
+
+def _scores(null: Hypothesis, noise: np.ndarray, response: np.ndarray | float = 0.0) -> SpotScores:
     """The same fit to data in which cells have a response of their own."""
-    return replace(state, residual=noise + state.whiten(state.value * response))
+    point = null.point
+    value = point.levels[:, np.newaxis] * point.value * (1.0 + np.ravel(response)) + noise
+    return spot_scores(replace(null, point=point.problem_with(Data(value, point.problem.data.weight))))
 
 
 @pytest.mark.rng("noise makes spots as often as it is said to")
-def test_noise_makes_spots_as_often_as_it_is_said_to(state: State, rng: np.random.Generator) -> None:
+def test_noise_makes_spots_as_often_as_it_is_said_to(null: Hypothesis, rng: np.random.Generator) -> None:
     """Hardly more often, and not next to never: the bound counts maxima of all sizes as if they were independent."""
-    chances = [
-        spot_channel(replace(state, residual=rng.standard_normal(state.residual.shape))).probability
-        for _ in range(400)
-    ]
+    chances = [_scores(null, _noise(rng)).channel().probability for _ in range(400)]
     seen = sum(chance < 0.1 for chance in chances)
     assert 4 <= seen <= 40 + 3 * 6
     assert min(chances) > 1e-5
 
 
 @pytest.mark.rng("spots of noise are worth little")
-def test_spots_of_noise_are_worth_little(state: State, rng: np.random.Generator) -> None:
-    worth = [
-        log_evidence_of_spots(replace(state, residual=rng.standard_normal(state.residual.shape)))
-        for _ in range(100)
-    ]
+def test_spots_of_noise_are_worth_little(null: Hypothesis, rng: np.random.Generator) -> None:
+    worth = [_scores(null, _noise(rng)).evidence() for _ in range(100)]
     assert min(worth) == 0.0
     assert max(worth) < 6.0
 
@@ -71,60 +68,60 @@ def test_spots_of_noise_are_worth_little(state: State, rng: np.random.Generator)
 @pytest.mark.parametrize(("y", "x", "radius"), [(20.0, 25.0, 5.0), (1.0, 46.0, 8.0)])
 @pytest.mark.rng("a spot is seen and a misfit of the thickness is none")
 def test_a_spot_is_seen_and_a_misfit_of_the_thickness_is_none(
-    state: State, rng: np.random.Generator, y: float, x: float, radius: float
+    null: Hypothesis, rng: np.random.Generator, y: float, x: float, radius: float
 ) -> None:
-    noise = rng.standard_normal(state.residual.shape)
-    stained = _with(state, -0.001 * _round(y, x, radius), noise)
-    assert spot_channel(stained).probability < 1e-6
-    bent = replace(state, residual=noise + state.design.slope * 0.01 * _round(y, x, radius))
-    plain = spot_channel(replace(state, residual=noise))
-    assert spot_channel(bent).statistic == pytest.approx(plain.statistic)
+    noise, spot = _noise(rng), _round(y, x, radius)
+    assert _scores(null, noise, -0.001 * spot).channel().probability < 1e-6
+    bent = null.point.levels[:, np.newaxis] * null.point.slope * 0.01 * spot.ravel()
+    plain = _scores(null, noise).channel()
+    assert _scores(null, noise + bent).channel().statistic == pytest.approx(plain.statistic, rel=1e-4)
 
 
 @pytest.mark.rng("light that all cells lack is no spot")
-def test_light_that_all_cells_lack_is_no_spot(state: State, rng: np.random.Generator) -> None:
-    noise = rng.standard_normal(state.residual.shape)
-    plain = spot_channel(replace(state, residual=noise)).statistic
-    assert spot_channel(_with(state, np.full(SHAPE, 0.01), noise)).statistic == pytest.approx(plain)
+def test_light_that_all_cells_lack_is_no_spot(null: Hypothesis, rng: np.random.Generator) -> None:
+    noise = _noise(rng)
+    plain = _scores(null, noise).channel().statistic
+    assert _scores(null, noise, 0.01).channel().statistic == pytest.approx(plain, rel=1e-4)
 
 
 @pytest.mark.rng("correlated noise makes no spots")
-def test_correlated_noise_makes_no_spots(state: State, rng: np.random.Generator) -> None:
-    noise = rng.standard_normal(state.residual.shape)
-    stained = _with(state, 5e-4 * _round(15.0, 20.0, 4.0), noise)
-    assert spot_channel(stained, 0.1).statistic == pytest.approx(spot_channel(stained).statistic / 1.4)
+def test_correlated_noise_makes_no_spots(null: Hypothesis, rng: np.random.Generator) -> None:
+    stained = _scores(null, _noise(rng), 5e-4 * _round(15.0, 20.0, 4.0))
+    correlated = SpotScores.beside_level(stained.score, stained.information, 0.1)
+    assert correlated.channel().statistic == pytest.approx(stained.channel().statistic / 1.4)
 
 
 @pytest.mark.rng("evidence is the integral over place size and depth")
-def test_evidence_is_the_integral_over_place_size_and_depth(state: State, rng: np.random.Generator) -> None:
+def test_evidence_is_the_integral_over_place_size_and_depth(
+    null: Hypothesis, rng: np.random.Generator
+) -> None:
     """Summed on a grid; over the depth in closed form."""
-    stained = _with(state, -0.0015 * _round(21.0, 26.0, 6.0), rng.standard_normal(state.residual.shape))
-    level = beside_thickness(stained, stained.whiten(stained.value))
-    seen = stained.residual - level * (stained.residual * level).sum() / (level**2).sum()
+    stained = _scores(null, _noise(rng), -0.0015 * _round(21.0, 26.0, 6.0))
+    score, information = stained.score, stained.information
     places, logarithms = np.linspace(-2.0, 2.0, 13), np.log(6.0) + np.linspace(-0.4, 0.4, 13)
     logs = []
     for y in 21.0 + places:
         for x in 26.0 + places:
             for logarithm in logarithms:
-                pattern = level * _round(y, x, float(np.exp(logarithm)))
-                pattern = pattern - level * (pattern * level).sum() / (level**2).sum()
-                square = float((pattern**2).sum())
-                depth = float((seen * pattern).sum()) / square
+                pattern = _round(y, x, float(np.exp(logarithm)))
+                pattern = pattern - (pattern * information).sum() / information.sum()
+                square = float((pattern**2 * information).sum())
+                depth = float((score * pattern).sum()) / square
                 logs.append(0.5 * depth**2 * square - np.log(abs(depth)) + 0.5 * np.log(2.0 * np.pi / square))
     cell = (places[1] - places[0]) ** 2 * (logarithms[1] - logarithms[0])
     choices = SHAPE[0] * SHAPE[1] * np.log(RADII[-1] / RADII[0]) * 2.0 * DEPTHS
     expected = float(logsumexp(logs)) + np.log(cell / choices)
     assert expected > 20.0
     # A second spot in the noise may be worth a little.
-    assert log_evidence_of_spots(stained) == pytest.approx(expected, abs=0.7)
+    assert stained.evidence() == pytest.approx(expected, abs=0.7)
 
 
 @pytest.mark.rng("several spots are worth more than one")
-def test_several_spots_are_worth_more_than_one(state: State, rng: np.random.Generator) -> None:
-    noise = rng.standard_normal(state.residual.shape)
+def test_several_spots_are_worth_more_than_one(null: Hypothesis, rng: np.random.Generator) -> None:
+    noise = _noise(rng)
     places = [(10.0, 10.0, 5.0), (12.0, 19.0, 4.0), (30.0, 40.0, 7.0)]
     worth = [
-        log_evidence_of_spots(_with(state, -0.0015 * sum(_round(*place) for place in places[:number]), noise))
+        _scores(null, noise, -0.0015 * sum(_round(*place) for place in places[:number])).evidence()
         for number in range(4)
     ]
     assert np.diff(worth).min() > 10.0

@@ -6,16 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from foreign_sky import foreign_map
+from lsst.fringe_sim.algorithms.discovery.fit import Coordinate, Fit, Problem, fit_model
+from lsst.fringe_sim.algorithms.discovery.selection import Hypothesis, Selector
+from lsst.fringe_sim.algorithms.discovery.validation import disagreement_size, validate
 from recorded_numbers import Record
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, selection
 from lsst.fringe_sim.algorithms.discovery.evaluations import count_evaluations
-from lsst.fringe_sim.algorithms.discovery.fit import Coordinate, Fit, Problem, fit_model
 from lsst.fringe_sim.algorithms.discovery.pairs import fitted_pair, likely_pairs
 from lsst.fringe_sim.algorithms.discovery.preparation import Prepared, prepare
-from lsst.fringe_sim.algorithms.discovery.selection import Hypothesis, Selector
 from lsst.fringe_sim.algorithms.discovery.set_search import SetSearch
-from lsst.fringe_sim.algorithms.discovery.validation import disagreement_size, validate
 from lsst.fringe_sim.array_types import FloatArray
 from lsst.fringe_sim.challenge.sealed_cases import expose
 from lsst.fringe_sim.effects import EFFECTS

@@ -13,9 +13,7 @@ BUDGET_S = 100.0
 CASE = draw_case("one", np.random.default_rng(31), size=(48, 64), only=["ghost_pedestal"])
 
 
-def stopped(
-    monkeypatch: pytest.MonkeyPatch, line: str, at_s: float, core: str = "present", evaluation_s: float = 0.0
-) -> Verdict:
+def stopped(monkeypatch: pytest.MonkeyPatch, line: str, at_s: float, evaluation_s: float = 0.0) -> Verdict:
     """Verdict of a search whose clock goes on by so much at every evaluation, and jumps once a line is said."""
     clock = {"now": 0.0}
 
@@ -29,32 +27,26 @@ def stopped(
         if said.startswith(line):
             clock["now"] = max(clock["now"], at_s)
 
-    options = SearchOptions(time_budget_s=BUDGET_S, core=core)
+    options = SearchOptions(time_budget_s=BUDGET_S)
     return discover(CASE.cube, CASE.setup, rng=np.random.default_rng(0), options=options, report=report)
 
 
-def test_time_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    verdict = stopped(monkeypatch, "fitting the thickness", 2 * BUDGET_S)
+@pytest.mark.parametrize("line", ["fitting the thickness", "chance that noise"])
+def test_time_for_nothing(monkeypatch: pytest.MonkeyPatch, line: str) -> None:
+    verdict = stopped(monkeypatch, line, 2 * BUDGET_S)
     assert (verdict.verdict, verdict.complete) == ("unexplained", False)
     assert verdict.effects == ()
     assert "stopped" in verdict.summary()
 
 
-@pytest.mark.parametrize("line", ["fitting the thickness", "chance that noise"])
-def test_the_new_core_says_that_it_was_stopped(monkeypatch: pytest.MonkeyPatch, line: str) -> None:
-    verdict = stopped(monkeypatch, line, 2 * BUDGET_S, "marginal")
-    assert (verdict.verdict, verdict.complete) == ("unexplained", False)
-    assert verdict.effects == ()
-
-
 @pytest.mark.slow
-def test_the_new_core_judges_the_best_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_best_so_far_is_judged_on_data_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """A tenth of the evaluations that a budget allows suffices for the judgement, whatever the machine takes for one.
 
     The whole search takes about seven thousand, of which the judgement takes seven hundred.
     """
     line, of_many = "  ghost_pedestal", BUDGET_S / 20_000
-    verdict = stopped(monkeypatch, line, 0.9 * BUDGET_S, "marginal", of_many)
+    verdict = stopped(monkeypatch, line, 0.9 * BUDGET_S, of_many)
     assert not verdict.complete
     assert verdict.gap.heldout_after < verdict.gap.heldout_before
     (found,) = verdict.effects
@@ -63,34 +55,12 @@ def test_the_new_core_judges_the_best_so_far(monkeypatch: pytest.MonkeyPatch) ->
     assert not again.complete
     assert again.size == pytest.approx(verdict.size)
     for late in (
-        stopped(monkeypatch, line, 2 * BUDGET_S, "marginal"),
-        stopped(monkeypatch, line, 0.9 * BUDGET_S, "marginal", BUDGET_S / 4_000),
+        stopped(monkeypatch, line, 2 * BUDGET_S),
+        stopped(monkeypatch, line, 0.9 * BUDGET_S, BUDGET_S / 4_000),
     ):
         assert (late.verdict, late.complete, late.effects) == ("unexplained", False, ())
         assert any("not judged" in note for note in late.notes)
         assert late.size["of_counts"] > 0.0
-
-
-@pytest.mark.slow
-def test_what_was_not_judged_on_data_held_out_is_not_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    verdict = stopped(monkeypatch, "  with ", 2 * BUDGET_S)
-    assert (verdict.verdict, verdict.complete) == ("unexplained", False)
-    assert verdict.effects == ()
-    assert any("not judged" in note for note in verdict.notes)
-    assert verdict.size["of_counts"] > 0.0
-
-
-@pytest.mark.slow
-def test_the_best_so_far_is_judged_on_data_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The time kept for it suffices, as the clock stands still: the effect has its class, and the search no end."""
-    verdict = stopped(monkeypatch, "  with ghost_pedestal", 0.9 * BUDGET_S)
-    assert not verdict.complete
-    assert verdict.gap.heldout_after < verdict.gap.heldout_before
-    (found,) = verdict.effects
-    assert "ghost_pedestal" in {found.name, *found.ambiguous_with}
-    again = Verdict.from_json(verdict.to_json())
-    assert not again.complete
-    assert again.size == pytest.approx(verdict.size)
 
 
 def test_a_budget_is_positive() -> None:

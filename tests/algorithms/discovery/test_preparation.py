@@ -1,4 +1,4 @@
-"""The search on one likelihood: what it finds, and what the part held out may not do."""
+"""What a search begins with, what it finds, and what the part held out may not do."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
-from lsst.fringe_sim.algorithms.discovery.marginal.neighbour_order import in_order_of_neighbours
-from lsst.fringe_sim.algorithms.discovery.marginal.preparation import Prepared, _in_parts, prepare
-from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
+from lsst.fringe_sim.algorithms.discovery.neighbour_order import in_order_of_neighbours
+from lsst.fringe_sim.algorithms.discovery.preparation import Prepared, _in_parts, prepare
 from lsst.fringe_sim.algorithms.inference import CellShape
 from lsst.fringe_sim.effects import known_effects
-from lsst.fringe_sim.errors import UnknownNameError
 from lsst.fringe_sim.model import FringeModel
 from lsst.fringe_sim.products import FlatExposures, FringeCube
 
@@ -45,7 +43,7 @@ def cube_of(
 
 def verdict_of(cube: FringeCube) -> Verdict:
     """What the search says of it."""
-    return discover(cube, "ts8_e2v", rng=np.random.default_rng(5), options=SearchOptions(core="marginal"))
+    return discover(cube, "ts8_e2v", rng=np.random.default_rng(5))
 
 
 @pytest.mark.slow
@@ -74,7 +72,7 @@ def test_selection_does_not_see_the_part_held_out(rng: np.random.Generator) -> N
     effects = [effect for effect in known_effects(None) if not effect.sky_only]
 
     def prepared(cube: FringeCube):  # type: ignore[no-untyped-def]
-        return prepare(cube, model, effects, 20_000, Rules(), np.random.default_rng(5))
+        return prepare(cube, model, effects, SearchOptions(), np.random.default_rng(5))
 
     first = prepared(cube)
     held = first.unseen.seen
@@ -93,7 +91,7 @@ def test_cells_suit_a_contrast_that_is_not_known(rng: np.random.Generator) -> No
 
     def prepared(contrast: float) -> Prepared:
         cube = cube_of(rng, {"contrast_loss.factor": contrast}, 64)
-        return prepare(cube, model, effects, 20_000, Rules(), np.random.default_rng(5))
+        return prepare(cube, model, effects, SearchOptions(), np.random.default_rng(5))
 
     plain, weak = prepared(1.0), prepared(0.1)
     assert plain.cells.cell_px == 1
@@ -110,14 +108,9 @@ def test_pixels_see_a_point_or_their_area_by_the_likelihood(places: int, rng: np
     cube = cube_of(rng, {"contrast_loss.factor": 0.8}, 64, places)
     effects = [effect for effect in known_effects(None) if not effect.sky_only]
     model = FringeModel.from_setup("ts8_e2v")
-    found = prepare(cube, model, effects, 20_000, Rules(), np.random.default_rng(5))
+    found = prepare(cube, model, effects, SearchOptions(), np.random.default_rng(5))
     assert found.problem.forward.shape.area == (places > 1)
     assert found.free.problem.forward.contrast == pytest.approx(0.8, abs=0.01)
-
-
-def test_another_core_is_refused() -> None:
-    with pytest.raises(UnknownNameError, match="core"):
-        SearchOptions(core="newest")
 
 
 def test_the_thickness_of_larger_cells_is_continued_within_them() -> None:

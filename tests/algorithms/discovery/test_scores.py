@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
-from lsst.fringe_sim.algorithms.discovery.marginal.scores import Scorer
+from lsst.fringe_sim.algorithms.discovery.options import SearchOptions
+from lsst.fringe_sim.algorithms.discovery.scores import Scorer
 from lsst.fringe_sim.algorithms.inference import CellShape, Data, Forward, Problem, coordinates_of, relaxed
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.model import FringeModel
@@ -25,7 +25,7 @@ def scorer_of(hidden: dict[str, float]) -> Scorer:
     value = forward.predict(hidden, thickness.ravel())[0]
     data = Data(value, np.full(value.shape, 1e-3**-2.0))
     point = relaxed(Problem(data, forward, thickness.ravel(), 1e-5).at({}, np.ones(8), thickness.ravel()))
-    return Scorer(point, point.level_columns, Rules().sizes)
+    return Scorer(point, point.level_columns, SearchOptions().sizes)
 
 
 def test_an_effect_that_repeats_promises_by_secants_what_its_derivative_does_not_see() -> None:

@@ -1,4 +1,4 @@
-"""What the search on one likelihood concludes: held-out data, a stand-in, the accuracy of the model, what is left."""
+"""What a search concludes: held-out data, a stand-in, the accuracy of the model, what is left."""
 
 from dataclasses import replace
 
@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
-from lsst.fringe_sim.algorithms.discovery.marginal.accuracy import evidence_within, told_accuracy
-from lsst.fringe_sim.algorithms.discovery.marginal.heldout import Unseen, judge_unseen
-from lsst.fringe_sim.algorithms.discovery.marginal.lesson import in_all_data
-from lsst.fringe_sim.algorithms.discovery.marginal.pace import Pace
-from lsst.fringe_sim.algorithms.discovery.marginal.preparation import Prepared, prepare
-from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
-from lsst.fringe_sim.algorithms.discovery.marginal.telling import size_of
+from lsst.fringe_sim.algorithms.discovery.accuracy import evidence_within, told_accuracy
+from lsst.fringe_sim.algorithms.discovery.heldout import Unseen, judge_unseen
+from lsst.fringe_sim.algorithms.discovery.lesson import in_all_data
+from lsst.fringe_sim.algorithms.discovery.pace import Pace
+from lsst.fringe_sim.algorithms.discovery.preparation import Prepared, prepare
+from lsst.fringe_sim.algorithms.discovery.telling import size_of
 from lsst.fringe_sim.algorithms.inference import Hypothesis, coordinates_of, fit
 from lsst.fringe_sim.effects import EFFECTS, Effect
 from lsst.fringe_sim.model import FringeModel
@@ -22,7 +21,7 @@ WAVELENGTHS = np.linspace(880.0, 990.0, 8)
 SIDE = 32
 ELECTRONS = 20_000.0
 Y, X = np.mgrid[:SIDE, :SIDE] / SIDE
-PRIOR = Rules().outsider_prior
+PRIOR = SearchOptions().outsider_prior
 
 
 def flats_of(effects: dict[str, float], contrast: np.ndarray | float = 1.0) -> np.ndarray:
@@ -49,7 +48,7 @@ def catalogue(*names: str) -> list[Effect]:
 
 def prepared_of(cube: FringeCube, *names: str) -> Prepared:
     model = FringeModel.from_setup("ts8_e2v")
-    return prepare(cube, model, catalogue(*names), 20_000, Rules(), np.random.default_rng(5))
+    return prepare(cube, model, catalogue(*names), SearchOptions(), np.random.default_rng(5))
 
 
 def fitted(prepared: Prepared, name: str, **values: float) -> Hypothesis:
@@ -61,7 +60,7 @@ def fitted(prepared: Prepared, name: str, **values: float) -> Hypothesis:
 
 
 def verdict_of(cube: FringeCube, *names: str, **limits: float) -> Verdict:
-    options = SearchOptions(core="marginal", **limits)
+    options = SearchOptions(**limits)
     return discover(cube, "ts8_e2v", catalogue(*names), rng=np.random.default_rng(5), options=options)
 
 
@@ -176,7 +175,7 @@ def test_errors_of_the_tables_are_within_the_accuracy_of_the_model(rng: np.rando
     model = FringeModel.from_setup("ts8_e2v")
     layer = model.system.stack.layers[model.system.stack.position(model.system.varying)]
     index = np.real(layer.medium.index(WAVELENGTHS, model.system.temperature_k))
-    null, rules = prepared.null, Rules()
+    null, rules = prepared.null, SearchOptions()
     assert told_accuracy(null, null, index, rules, 1e-6, 0.0)["chance"] < 1e-9
     assert told_accuracy(null, null, index, rules, 0.014, 0.0)["chance"] > rules.significance
     # What a mean of these errors is, an effect need not be.

@@ -1,4 +1,4 @@
-"""The search on one likelihood of a few pixels, down to one: counts over the mean of their sensor."""
+"""The search of a few pixels, down to one: counts over the mean of their sensor."""
 
 from dataclasses import replace
 
@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
+from lsst.fringe_sim.algorithms.discovery.catalogue import Catalogue
 from lsst.fringe_sim.algorithms.discovery.continuation import continued
-from lsst.fringe_sim.algorithms.discovery.marginal.catalogue import Catalogue
-from lsst.fringe_sim.algorithms.discovery.marginal.heldout import judge_unseen
-from lsst.fringe_sim.algorithms.discovery.marginal.neighbour_order import in_order_of_neighbours
-from lsst.fringe_sim.algorithms.discovery.marginal.next_flats import FlatForecast
-from lsst.fringe_sim.algorithms.discovery.marginal.preparation import OPEN_ORDERS, Prepared, prepare
-from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
-from lsst.fringe_sim.algorithms.discovery.marginal.search import SetSearch
+from lsst.fringe_sim.algorithms.discovery.heldout import judge_unseen
+from lsst.fringe_sim.algorithms.discovery.neighbour_order import in_order_of_neighbours
+from lsst.fringe_sim.algorithms.discovery.next_flats import FlatForecast
 from lsst.fringe_sim.algorithms.discovery.noise import STATED_UNCERTAINTY
+from lsst.fringe_sim.algorithms.discovery.preparation import OPEN_ORDERS, Prepared, prepare
+from lsst.fringe_sim.algorithms.discovery.set_search import SetSearch
 from lsst.fringe_sim.algorithms.inference import Hypothesis, coordinates_of, fit, led, relaxed
 from lsst.fringe_sim.effects import EFFECTS, Effect
 from lsst.fringe_sim.effects.ring_search import find_rings
@@ -62,7 +61,7 @@ def catalogue(names: tuple[str, ...] = FEW) -> list[Effect]:
 
 def prepared_of(cube: FringeCube) -> Prepared:
     model = FringeModel.from_setup("ts8_e2v")
-    return prepare(cube, model, catalogue(), 20_000, Rules(), np.random.default_rng(5))
+    return prepare(cube, model, catalogue(), SearchOptions(), np.random.default_rng(5))
 
 
 def fitted(prepared: Prepared, name: str) -> Hypothesis:
@@ -74,12 +73,11 @@ def fitted(prepared: Prepared, name: str) -> Hypothesis:
 def search_of(prepared: Prepared, *, noise: bool) -> SetSearch:
     """``noise``: what is said of whatever a set leaves."""
     known = Catalogue.of(catalogue(), prepared.problem)
-    return SetSearch(known, prepared.null, Rules(), lambda text: None, lambda found: noise)
+    return SetSearch(known, prepared.null, SearchOptions(), lambda text: None, lambda found: noise)
 
 
 def verdict_of(cube: FringeCube, names: tuple[str, ...] = FEW) -> Verdict:
-    options = SearchOptions(core="marginal")
-    return discover(cube, "ts8_e2v", catalogue(names), rng=np.random.default_rng(5), options=options)
+    return discover(cube, "ts8_e2v", catalogue(names), rng=np.random.default_rng(5))
 
 
 # Preparation ------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""What the search on one likelihood forecasts of further flats, and what it lets a correction be learned from."""
+"""What a search forecasts of further flats, and what it lets a correction be learned from."""
 
 from dataclasses import replace
 
@@ -9,16 +9,16 @@ from lsst.fringe_sim.algorithms.discovery.cells import CellData
 from lsst.fringe_sim.algorithms.discovery.continuation import continued
 from lsst.fringe_sim.algorithms.discovery.learned_columns import LocalColumns
 from lsst.fringe_sim.algorithms.discovery.learning import best_evidence, learn
-from lsst.fringe_sim.algorithms.discovery.marginal.lesson import (
+from lsst.fringe_sim.algorithms.discovery.lesson import (
     CellLesson,
     CellPart,
     together,
     unseen_too,
     with_corrections,
 )
-from lsst.fringe_sim.algorithms.discovery.marginal.next_flats import FlatForecast
-from lsst.fringe_sim.algorithms.discovery.marginal.preparation import prepare
-from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
+from lsst.fringe_sim.algorithms.discovery.next_flats import FlatForecast
+from lsst.fringe_sim.algorithms.discovery.options import SearchOptions
+from lsst.fringe_sim.algorithms.discovery.preparation import prepare
 from lsst.fringe_sim.algorithms.inference import (
     CellShape,
     Data,
@@ -138,7 +138,7 @@ def test_light_that_wanders_is_learned_and_noise_is_not() -> None:
         case = draw_case("outsider" if outsider else "none", rng, size=(48, 48), only=only)
         own = [effect for effect in EFFECTS if not effect.sky_only]
         prepared = prepare(
-            case.cube, FringeModel.from_setup(case.setup), own, 20_000, Rules(), np.random.default_rng(5)
+            case.cube, FringeModel.from_setup(case.setup), own, SearchOptions(), np.random.default_rng(5)
         )
         lesson = CellLesson.of(prepared, prepared.null)
         found = learn(lesson, np.random.default_rng(1), LEAST)
@@ -170,7 +170,7 @@ def test_fringes_of_a_few_cells_keep_their_order_where_cells_were_held_out() -> 
     """A third of an order from cell to cell, and blocks of six cells."""
     case = draw_case("none", np.random.default_rng(12), size=(48, 48))
     prepared = prepare(
-        case.cube, FringeModel.from_setup(case.setup), [], 20_000, Rules(), np.random.default_rng(5)
+        case.cube, FringeModel.from_setup(case.setup), [], SearchOptions(), np.random.default_rng(5)
     )
     point = unseen_too(prepared, prepared.point, together(prepared))
     order = prepared.problem.forward.order_um

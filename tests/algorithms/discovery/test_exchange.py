@@ -7,15 +7,15 @@ from typing import cast
 import numpy as np
 import pytest
 
+from lsst.fringe_sim.algorithms.discovery import set_search as sets_module
+from lsst.fringe_sim.algorithms.discovery.catalogue import Catalogue
 from lsst.fringe_sim.algorithms.discovery.channels import Channel
-from lsst.fringe_sim.algorithms.discovery.marginal import search as sets_module
-from lsst.fringe_sim.algorithms.discovery.marginal.catalogue import Catalogue
-from lsst.fringe_sim.algorithms.discovery.marginal.critics import is_out_of_reach
-from lsst.fringe_sim.algorithms.discovery.marginal.naming import name_effects
-from lsst.fringe_sim.algorithms.discovery.marginal.pairs import ScoredPair
-from lsst.fringe_sim.algorithms.discovery.marginal.rules import Rules
-from lsst.fringe_sim.algorithms.discovery.marginal.scores import Scored, Scorer, best_gain
-from lsst.fringe_sim.algorithms.discovery.marginal.search import SetSearch
+from lsst.fringe_sim.algorithms.discovery.critics import is_out_of_reach
+from lsst.fringe_sim.algorithms.discovery.naming import name_effects
+from lsst.fringe_sim.algorithms.discovery.options import SearchOptions
+from lsst.fringe_sim.algorithms.discovery.pairs import ScoredPair
+from lsst.fringe_sim.algorithms.discovery.scores import Scored, Scorer, best_gain
+from lsst.fringe_sim.algorithms.discovery.set_search import SetSearch
 from lsst.fringe_sim.algorithms.inference import (
     CellShape,
     Data,
@@ -50,7 +50,11 @@ def search_of(rng: np.random.Generator, hidden: dict[str, float], map_um: float 
         problem = replace(problem, thickness_sigma_um=np.full(thickness.size, map_um), known=True)
     null = fit((), (), relaxed(problem.at({}, np.ones(8), thickness.ravel()), rounds=6))
     return SetSearch(
-        Catalogue.of(effects, null.point.problem), null, Rules(), lambda text: None, lambda found: True
+        Catalogue.of(effects, null.point.problem),
+        null,
+        SearchOptions(),
+        lambda text: None,
+        lambda found: True,
     )
 
 
@@ -63,7 +67,7 @@ def fitted(search: SetSearch, *names: str) -> Hypothesis:
 @pytest.mark.rng("promise of pairs")
 def test_a_pair_promises_what_its_parameters_do_together(rng: np.random.Generator) -> None:
     search = search_of(rng, {"bandwidth.fwhm": 2.2, "wavelength_offset.offset": 0.3})
-    scorer = Scorer(search.null.point, search.null.point.level_columns, Rules().sizes)
+    scorer = Scorer(search.null.point, search.null.point.level_columns, SearchOptions().sizes)
     for name in FEW:
         scorer.score(name, search.catalogue.items[name])
     best = scorer.joint().best_pairs(best_gain, 0.0)[0]
@@ -111,9 +115,9 @@ def test_an_effect_is_hoped_to_bring_the_part_of_its_promise_that_it_has_brought
     search = search_of(rng, {"wavelength_offset.offset": 0.6})
     scored = {one.name: one for one in search.scores(search.null)}
     before = search.hoped(scored["bandwidth"])
-    assert before == pytest.approx(max(scored["bandwidth"].gain, 0.0) / Rules().least_of_promise)
+    assert before == pytest.approx(max(scored["bandwidth"].gain, 0.0) / SearchOptions().least_of_promise)
     brings = search._added(search.null, scored["bandwidth"]).log_evidence - search.null.log_evidence
-    part = min(max(brings, 0.0) / scored["bandwidth"].gain, 1.0 / Rules().least_of_promise)
+    part = min(max(brings, 0.0) / scored["bandwidth"].gain, 1.0 / SearchOptions().least_of_promise)
     # Beside another effect it may promise more, and bring more.
     assert search.hoped(replace(scored["bandwidth"], gain=1e6)) == pytest.approx(1e6 * part)
 
@@ -179,7 +183,7 @@ def test_no_effect_promises_what_a_thickness_led_astray_has_cost(
     )
     assert best.gain < 1.1 * brings
     point = led(astray.null.point)
-    alone = Scorer(point, point.level_columns, Rules().sizes)
+    alone = Scorer(point, point.level_columns, SearchOptions().sizes)
     assert alone.score("epoxy_index", astray.catalogue.items["epoxy_index"]).gain > 10.0 * brings
 
 
@@ -264,7 +268,7 @@ def test_a_set_whose_cells_lie_an_order_off_is_found_in_the_right_one(
 )  # fmt: skip
 def test_what_is_left_is_out_of_reach_where_no_effects_take_it_off(name: str, fall: float, out: bool) -> None:
     found = cast(Hypothesis, SimpleNamespace(point=SimpleNamespace(response=np.ones((2, 3))), chi2=0.0))
-    assert is_out_of_reach([Channel(name, 500.0, 100.0, 0.0)], found, found, fall, Rules()) == out
+    assert is_out_of_reach([Channel(name, 500.0, 100.0, 0.0)], found, found, fall, SearchOptions()) == out
 
 
 @pytest.mark.parametrize(("number", "named"), [(1, True), (2, True), (3, False)])
@@ -287,7 +291,7 @@ def test_one_cause_outside_the_catalogue_in_the_place_of_three_effects_leaves_th
         pool={frozenset(names): best},
         posterior=lambda one: one.log_evidence,
         without=lambda one, name: found(tuple(n for n in one.effects if n != name), 1e5),
-        rules=Rules(),
+        rules=SearchOptions(),
     )
     naming = name_effects(sets, best, 1e6, 0.5)  # type: ignore[arg-type]
     assert len(naming.effects) == number
