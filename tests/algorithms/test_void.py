@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from foreign_sky import foreign_map
+from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from recorded_numbers import Record
 
 from lsst.fringe_sim.algorithms import fit_thickness, simulate_sky_frame
 from lsst.fringe_sim.algorithms.discovery import discover
-from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from lsst.fringe_sim.algorithms.flat_residual import flat_residual
 from lsst.fringe_sim.algorithms.thickness_fit.islands import fit_islands
 from lsst.fringe_sim.challenge.sealed_cases import SealedCase, draw_case, expose

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-
 from lsst.fringe_sim.algorithms.discovery.fit import Fit
+
 from lsst.fringe_sim.challenge import oracle
 from lsst.fringe_sim.challenge.oracle import visibility
 from lsst.fringe_sim.challenge.sealed_cases import CASE_KINDS, SealedCase, draw_case, expose

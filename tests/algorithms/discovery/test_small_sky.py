@@ -146,7 +146,7 @@ def test_an_effect_whose_derivative_promises_too_little_is_found() -> None:
     catalogue = [effect for effect in EFFECTS if effect.name in (*NAMES, "oh_bands")]
     verdict = discover_sky(
         frames, known, MAP_UM, "monocam", catalogue,
-        rng=np.random.default_rng(seed), options=replace(SKY_SEARCH, core="marginal"),
+        rng=np.random.default_rng(seed),
     )  # fmt: skip
     assert verdict.verdict == "named", verdict.summary()
     (found,) = verdict.effects

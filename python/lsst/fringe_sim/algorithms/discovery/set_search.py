@@ -7,19 +7,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
-import numpy as np
-
-from ...array_types import FloatArray
 from ..inference import Coordinate, Hypothesis, fit, in_open_orders, in_whole_orders, jumped, led
 from ..inference.marginal import Point
 from .catalogue import Catalogue
-from .island_places import moved_island
+from .island_places import in_best_place
 from .open_orders import best_of_orders, scorer_at
 from .options import SearchOptions
 from .pace import Pace
 from .pairs import Joint, ScoredPair
 from .scores import Scored, best_gain, grouped, proposed
-from .starts import best_start, linear_start, without_keys
+from .starts import fitted_elsewhere, linear_start, without_keys
 from .valleys import in_deepest_valleys, over_valleys
 
 
@@ -417,40 +414,22 @@ class SetSearch:
         """The fit from what an effect proposes; of an island from the best place about that, too."""
         assert one.start is not None
         found, effect = self._fit(names, items, one.start), self.catalogue.effects[one.name]
-        own = self.catalogue.items[one.name]
-        start = moved_island(effect, own, found.point) if effect.local else None
-        while start is not None:
-            new = self._fit(names, items, start)
-            if new.log_evidence <= found.log_evidence:
-                break
-            found, start = new, moved_island(effect, own, new.point)
-        return found
+        if not effect.local:
+            return found
+        return in_best_place(effect, self.catalogue.items[one.name], found, partial(self._fit, names, items))
 
     def _fitted(
         self, base: Hypothesis, one: Scored, names: tuple[str, ...], items: tuple[Coordinate, ...]
     ) -> Hypothesis:
         """The fit from the linear step; from elsewhere where that does not bring what it promised, or repeats."""
-        every = (*base.items, *items)
+        fitted = partial(self._fit, names, (*base.items, *items))
         first = linear_start(base, items, one.step)
-        found = self._fit(names, every, base.point if first is None else first)
+        found = fitted(base.point if first is None else first)
         kept = self._is_kept(base, found, one)
         if len(items) > 1 or (kept and not items[0].repeat):
             return found
-        (item,) = items
-        tried: list[FloatArray] = []
-        if not kept:
-            sides = (item.side,) if item.side else (1.0, -1.0)
-            tried += [np.array([item.null + s * x * item.scale]) for s in sides for x in self.rules.sizes]
-        for _ in range(self.rules.most_turns if item.repeat else 1):
-            if item.repeat:
-                value = found.point.settings[item.key]
-                tried += [np.array([value + turn * item.repeat]) for turn in (-1.0, 1.0)]
-            other = best_start(base, items, tried)
-            new = found if other is None else self._fit(names, every, other)
-            if new.log_evidence <= found.log_evidence:
-                break
-            found, tried = new, []
-        return found
+        sizes = () if kept else self.rules.sizes
+        return fitted_elsewhere(base, found, items[0], fitted, sizes, self.rules.most_turns)
 
     def _is_kept(self, base: Hypothesis, found: Hypothesis, one: Scored) -> bool:
         """Whether a fit brings what derivatives promised, or little less."""

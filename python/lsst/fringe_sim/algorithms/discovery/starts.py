@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -32,6 +32,33 @@ def linear_start(base: Hypothesis, items: tuple[Coordinate, ...], step: FloatArr
     parts = PARTS[:1] if len(items) == 1 else PARTS
     null = np.array([item.null for item in items])
     return best_start(base, items, [null + part * step for part in parts])
+
+
+def fitted_elsewhere(
+    base: Hypothesis,
+    found: Hypothesis,
+    item: Coordinate,
+    fitted: Callable[[Point], Hypothesis],
+    sizes: Sequence[float],
+    turns: int,
+) -> Hypothesis:
+    """The fit of an effect of one parameter, or the better one from elsewhere.
+
+    ``sizes``: departures from null that are tried, in prior scales. ``turns``: repeats by which the fit goes on, as
+    long as each brings more.
+    """
+    sides = (item.side,) if item.side else (1.0, -1.0)
+    tried = [np.array([item.null + side * size * item.scale]) for side in sides for size in sizes]
+    for _ in range(turns if item.repeat else 1):
+        if item.repeat:
+            value = found.point.settings[item.key]
+            tried += [np.array([value + turn * item.repeat]) for turn in (-1.0, 1.0)]
+        other = best_start(base, (item,), tried)
+        new = found if other is None else fitted(other)
+        if new.log_evidence <= found.log_evidence:
+            break
+        found, tried = new, []
+    return found
 
 
 def without_keys(point: Point, keys: set[str]) -> Point:

@@ -21,7 +21,7 @@ from lsst.fringe_sim.effects import EFFECTS
 def test_a_parameter_that_repeats_is_found_within_its_error(repeats: str, beside: str, seed: int) -> None:
     case = draw_case("two", np.random.default_rng([91, seed]), size=(48, 48), only=[repeats, beside])
     catalogue = [effect for effect in EFFECTS if effect.name in (repeats, beside)]
-    options = SearchOptions(core="marginal")
+    options = SearchOptions()
     verdict = discover(case.cube, case.setup, catalogue, rng=np.random.default_rng(0), options=options)
     found = {effect.name: effect for effect in verdict.effects}
     assert repeats in found, verdict.summary()
