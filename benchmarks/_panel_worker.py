@@ -15,7 +15,7 @@ import traceback
 from types import FrameType
 from typing import Any
 
-from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
+from lsst.fringe_sim.algorithms.discovery import Verdict, discover
 
 from ._panel_cases import PanelCase, checksum, read_cases
 
@@ -36,10 +36,10 @@ def main() -> None:
     cases = {case.case: case for case in read_cases()}
     for line in sys.stdin:
         job = json.loads(line)
-        print(_in_child(cases[job["case"]], job["fresh"], job["cap_s"], job.get("core", "")), flush=True)
+        print(_in_child(cases[job["case"]], job["fresh"], job["cap_s"]), flush=True)
 
 
-def _in_child(case: PanelCase, fresh: int | None, cap_s: float, core: str) -> str:
+def _in_child(case: PanelCase, fresh: int | None, cap_s: float) -> str:
     """Answer of a child, or that it was ended."""
     reading, writing = os.pipe()
     pid = os.fork()
@@ -47,7 +47,7 @@ def _in_child(case: PanelCase, fresh: int | None, cap_s: float, core: str) -> st
         os.close(reading)
         try:
             with os.fdopen(writing, "w") as out:
-                out.write(json.dumps(_searched(case, fresh, cap_s, core)))
+                out.write(json.dumps(_searched(case, fresh, cap_s)))
         except BaseException:  # the child must not go on as the parent
             traceback.print_exc()
         os._exit(0)
@@ -60,7 +60,7 @@ def _in_child(case: PanelCase, fresh: int | None, cap_s: float, core: str) -> st
     )
 
 
-def _searched(case: PanelCase, fresh: int | None, cap_s: float, core: str) -> dict[str, Any]:
+def _searched(case: PanelCase, fresh: int | None, cap_s: float) -> dict[str, Any]:
     data, search, factor = case.streams(fresh)
     cube, model = case.cube(data, factor), case.model()
     answer: dict[str, Any] = {"checksum": checksum(cube), "names": []}
@@ -69,8 +69,7 @@ def _searched(case: PanelCase, fresh: int | None, cap_s: float, core: str) -> di
     began = time.process_time()
     _limit(cap_s, began)
     try:
-        options = SearchOptions(core=core) if core else None
-        answer.update(_told(discover(cube, model, rng=search, options=options)))
+        answer.update(_told(discover(cube, model, rng=search)))
     except OutOfTimeError:
         answer["verdict"] = "timed out"
     except Exception as error:  # one case that fails must not end the panel

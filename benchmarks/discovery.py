@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from lsst.fringe_sim.algorithms.discovery import discover
-from lsst.fringe_sim.algorithms.discovery.basis import CellBasis
 from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
-from lsst.fringe_sim.algorithms.discovery.fit import Problem, coordinates_of, fit_model
-from lsst.fringe_sim.algorithms.discovery.forward import Forward
+from lsst.fringe_sim.algorithms.discovery.lesson import data_of
+from lsst.fringe_sim.algorithms.inference import CellShape, Forward, Problem, coordinates_of, fit
 from lsst.fringe_sim.effects import EFFECTS
 from lsst.fringe_sim.mock.thickness import random_field
 from lsst.fringe_sim.model import FringeModel
@@ -19,6 +18,7 @@ from ._table import Row, memory_now, memory_watch, timed
 SETUP = "ts8_e2v"
 LEVEL_E = 20_000.0
 HIDDEN = {"bandwidth.fwhm": 2.4}
+RESPONSE_SCATTER = 1e-3
 REFITTED = ("bandwidth", "roughness", "wavelength_offset")
 """Effects that are refitted at full resolution; the time of all is theirs times the number of effects."""
 
@@ -50,17 +50,15 @@ def _refits(cube: FringeCube, truth: np.ndarray) -> tuple[float, float]:
     """Wall and processor time of a refit of each effect of the catalogue, a few of them timed."""
     model = FringeModel.from_setup(SETUP)
     cells = bin_cube(cube, 1)
-    forward = Forward.of_cells(model, EFFECTS, cells, (float(truth.min()) - 0.5, float(truth.max()) + 0.5))
-    problem = Problem(cells, forward, CellBasis(truth.shape), np.eye(cube.shape[0]))
-    null = fit_model(problem, (), np.zeros(0), truth.ravel())
+    limits = (float(truth.min()) - 0.5, float(truth.max()) + 0.5)
+    forward = Forward(model, EFFECTS, cells.geometry, CellShape.of_field(truth, 1), limits)
+    problem = Problem(data_of(cells), forward, truth.ravel(), RESPONSE_SCATTER)
+    null = fit((), (), problem.at({}, np.ones(cube.shape[0]), truth.ravel()))
     wall = cpu = 0.0
     for name in REFITTED:
         effect = next(effect for effect in EFFECTS if effect.name == name)
-        coordinates = coordinates_of(effect, forward, truth)
-        start = np.array([0.03 * item.unit_step for item in coordinates])
-        _, own_wall, own_cpu = timed(
-            lambda c=coordinates, s=start: fit_model(problem, c, s, null.field, null.levels)  # type: ignore[misc]
-        )
+        items = coordinates_of(effect, forward)
+        _, own_wall, own_cpu = timed(lambda own=(name,), i=items: fit(own, i, null.point))  # type: ignore[misc]
         wall, cpu = wall + own_wall, cpu + own_cpu
     share = len(EFFECTS) / len(REFITTED)
     return wall * share, cpu * share

@@ -1,4 +1,4 @@
-"""The gate of the new core: sensors that no version has seen, drawn by one seed after the last change of the code.
+"""The gate: sensors that no version has seen, drawn by one seed after the last change of the code.
 
 ``python -m benchmarks gate --seed N --nulls 30 --singles 30 --pairs 20 --minutes 10`` searches them in turn, as many
 as the processor time allows, and prints every outcome as soon as it is known. Noise is stated wrongly by up to 20 %.
@@ -15,7 +15,7 @@ from itertools import chain, zip_longest
 
 import numpy as np
 
-from lsst.fringe_sim.algorithms.discovery import SearchOptions, discover
+from lsst.fringe_sim.algorithms.discovery import discover
 
 from ._panel_cases import PanelCase, read_cases
 from .panel import judge
@@ -41,7 +41,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--minutes", type=float, default=10.0, help="processor time")
-    parser.add_argument("--core", default="marginal")
     for kind, number in (("null", 30), ("single", 30), ("pair", 20)):
         parser.add_argument(f"--{kind}s", type=int, default=number)
     chosen = parser.parse_args(arguments)
@@ -55,16 +54,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for case in (case for row in zip_longest(*queues) for case in row if case is not None):
         if time.process_time() - begun > 60.0 * chosen.minutes:
             break
-        outcome = searched(case, int(rng.integers(2**31)), chosen.core)
+        outcome = searched(case, int(rng.integers(2**31)))
         counts[case.kind, outcome] += 1
     print(", ".join(f"{kind} {outcome}: {n}" for (kind, outcome), n in sorted(counts.items())))
 
 
-def searched(case: PanelCase, fresh: int, core: str) -> str:
+def searched(case: PanelCase, fresh: int) -> str:
     """Outcome of a case, which is printed with what it took."""
     data, search, factor = case.streams(fresh)
     cube, now = case.cube(data, factor), time.process_time()
-    verdict = discover(cube, case.model(), rng=search, options=SearchOptions(core=core))
+    verdict = discover(cube, case.model(), rng=search)
     classes = [[effect.name, *effect.ambiguous_with] for effect in verdict.effects]
     outcome = judge(case.kind, case.truth, verdict.verdict, classes)
     names = "+".join("~".join(names) for names in classes) or verdict.verdict

@@ -197,8 +197,7 @@ def write_results(path: Path, results: Iterable[PanelResult]) -> None:
 class _Worker:
     """A process that searches cases with the code of one checkout."""
 
-    def __init__(self, checkout: Path, core: str = "") -> None:
-        self.core = core
+    def __init__(self, checkout: Path) -> None:
         places = [str(checkout / "python"), str(ROOT)]
         threads = {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         environment = {**os.environ, **threads, "PYTHONPATH": os.pathsep.join(places)}
@@ -210,7 +209,7 @@ class _Worker:
     def search(self, case: PanelCase, fresh: int | None) -> dict[str, Any]:
         assert self.process.stdin is not None
         assert self.process.stdout is not None
-        job = {"case": case.case, "fresh": fresh, "cap_s": CAP_S, "core": self.core}
+        job = {"case": case.case, "fresh": fresh, "cap_s": CAP_S}
         self.process.stdin.write(json.dumps(job) + "\n")
         self.process.stdin.flush()
         answer: dict[str, Any] = json.loads(self.process.stdout.readline())
@@ -231,7 +230,6 @@ def run_cases(
     version: str = "",
     fresh: int | None = None,
     jobs: int = 1,
-    core: str = "",
     progress: Callable[[PanelResult], None] | None = None,
 ) -> list[PanelResult]:
     """Search cases with the code of a checkout.
@@ -248,8 +246,6 @@ def run_cases(
         Seed of a fresh draw of every case; without it they are those of the list.
     jobs : `int`, optional
         Cases that run at the same time.
-    core : `str`, optional
-        Which search (`SearchOptions.core`); that of the checkout by default.
     progress : callable, optional
         Called with every result.
     """
@@ -258,7 +254,7 @@ def run_cases(
 
     def search(case: PanelCase) -> PanelResult:
         if not hasattr(own, "worker"):
-            own.worker = _Worker(checkout, core)
+            own.worker = _Worker(checkout)
             workers.append(own.worker)
         result = _result(case, own.worker.search(case, fresh), version)
         if progress is not None:
@@ -315,8 +311,8 @@ def main(arguments: Sequence[str]) -> int:
     if chosen.fresh or chosen.seed is not None:
         fresh = int(np.random.default_rng().integers(2**31)) if chosen.seed is None else chosen.seed
         print(f"fresh draws of seed {fresh}", flush=True)
-    version = chosen.version or version_of(ROOT) + (f" {chosen.core}" if chosen.core else "")
-    results = _kept_up(cases, chosen.results, version, fresh, chosen.jobs, chosen.core)
+    version = chosen.version or version_of(ROOT)
+    results = _kept_up(cases, chosen.results, version, fresh, chosen.jobs)
     print("\n".join(["", *summary(results), ""]))
     before = {} if fresh is not None or not BASELINE.exists() else read_results(BASELINE)
     if chosen.against is not None:
@@ -356,7 +352,7 @@ def _beside(
 
 
 def _kept_up(
-    cases: Sequence[PanelCase], path: Path | None, version: str, fresh: int | None, jobs: int, core: str = ""
+    cases: Sequence[PanelCase], path: Path | None, version: str, fresh: int | None, jobs: int
 ) -> list[PanelResult]:
     """Results of all cases; those that a file has are not run again, and every new one is added to it at once."""
     ready: dict[str, PanelResult] = {}
@@ -371,7 +367,7 @@ def _kept_up(
                 out.write(json.dumps(vars(result)) + "\n")
 
     waiting = [case for case in cases if case.case not in ready]
-    new = run_cases(waiting, version=version, fresh=fresh, jobs=jobs, core=core, progress=progress)
+    new = run_cases(waiting, version=version, fresh=fresh, jobs=jobs, progress=progress)
     ready.update({result.case: result for result in new})
     return [ready[case.case] for case in cases]
 
@@ -402,9 +398,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--record", type=Path, metavar="FILE", help="write results in the layout of the baseline"
-    )
-    parser.add_argument(
-        "--core", default="", help="which search: present or marginal (default: the present one)"
     )
     parser.add_argument("--version", default="", help="what to call this version (default: its commit)")
     parser.add_argument(

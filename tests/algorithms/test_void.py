@@ -56,33 +56,6 @@ def test_moments_are_those_of_what_is_covered(radius: float) -> None:
     np.testing.assert_allclose(moments, true, atol=3e-3)
 
 
-@pytest.mark.parametrize("slope_um", [0.02, 0.09])
-@pytest.mark.parametrize("gap_nm", [13.0, 200.0])
-def test_cells_of_the_rim_see_each_stack_at_the_thickness_of_its_part(slope_um: float, gap_nm: float) -> None:
-    """Against the same sensor in cells of a fifteenth; both stacks at the thickness of the whole cell are far off."""
-
-    def seen(finer: int, mixed: bool = False) -> np.ndarray:
-        rows = np.arange(20 * finer) - finer // 2
-        thickness = 15.0 + slope_um / finer * np.add.outer(rows, 0.5 * rows)
-        place = {"void.centre_x": 7.3 * finer + finer // 2, "void.centre_y": 9.1 * finer + finer // 2}
-        settings = {"void.thickness": gap_nm, "void.radius": 4.6 * finer, **place}
-        limits = (float(thickness.min()) - 0.6, float(thickness.max()) + 0.6)
-        where = ImageGeometry.of_pixels(thickness.shape, np.array([900.0, 960.0]))
-        forward = Forward(FringeModel.from_setup("ts8_e2v"), EFFECTS, where, 1, limits)
-        if mixed:
-            part = forward.coverage("void", settings).ravel()
-            on, off = (each[:, 0] for each in forward.on_and_off_island("void", settings, thickness))
-            value = (off + part * (on - off)).reshape(2, *thickness.shape)
-        else:
-            value = forward.predict(settings, thickness).value
-        value = value.reshape(2, 20, finer, 20, finer).mean(axis=(2, 4))
-        return value / value[:, 15:].mean(axis=(1, 2), keepdims=True)
-
-    true = seen(15)
-    errors = [np.sqrt(np.mean((seen(1, mixed) - true)[:, 2:16, 1:14] ** 2)) for mixed in (False, True)]
-    assert errors[0] < 0.25 * errors[1]
-
-
 def test_the_rim_moves_smoothly() -> None:
     shape = geometry((40, 40))
     for step, key in ((1e-4, "radius"), (1e-4, "centre_x"), (1e-4, "centre_y")):

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lsst.fringe_sim.algorithms.discovery.selection import Selector
-from lsst.fringe_sim.algorithms.discovery.validation import disagreement_size
 
-from lsst.fringe_sim.algorithms.discovery.accuracy import MODEL_ACCURACY, chance_within_accuracy
-from lsst.fringe_sim.algorithms.discovery.options import SearchOptions
-from lsst.fringe_sim.algorithms.discovery.preparation import prepare
+from lsst.fringe_sim.algorithms.discovery.accuracy import told_accuracy
+from lsst.fringe_sim.algorithms.discovery.critics import judge, total_chance
+from lsst.fringe_sim.algorithms.discovery.options import MODEL_ACCURACY, SearchOptions
+from lsst.fringe_sim.algorithms.discovery.preparation import Prepared, prepare
+from lsst.fringe_sim.algorithms.discovery.telling import size_of
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.errors import OutOfRangeError
@@ -20,7 +20,7 @@ from lsst.fringe_sim.products.fringe_cube import FlatExposures, FringeCube
 
 WAVELENGTHS = np.arange(880.0, 991.0, 10.0)
 ELECTRONS = 3e7
-SIGNIFICANCE = SearchOptions().significance
+RULES = SearchOptions()
 OWN = [effect for effect in EFFECTS if not effect.sky_only]
 
 
@@ -37,9 +37,21 @@ def straight(medium: Medium) -> Medium:
     )
 
 
-def selector_of(cube: FringeCube, setup: str) -> Selector:
-    prepared = prepare(cube, FringeModel.from_setup(setup), OWN, 20_000)
-    return Selector(prepared.problem, OWN, prepared.null, prepared.index, generic=prepared.rich)
+def prepared_of(cube: FringeCube, setup: str) -> Prepared:
+    return prepare(cube, FringeModel.from_setup(setup), OWN, RULES, np.random.default_rng(5))
+
+
+def index_of(prepared: Prepared) -> np.ndarray:
+    """Index of the layer that varies."""
+    system, wavelength = prepared.problem.forward.model.system, prepared.cells.wavelength_nm
+    medium = system.stack.layers[system.stack.position(system.varying)].medium
+    return np.asarray(np.real(medium.index(wavelength, system.temperature_k)))
+
+
+def chance_within(prepared: Prepared, accuracy: float) -> float:
+    """Chance of what the unchanged model leaves where it may be wrong by so much."""
+    null = prepared.null
+    return float(told_accuracy(null, null, index_of(prepared), RULES, accuracy, 0.0)["chance"])
 
 
 @pytest.mark.slow
@@ -62,13 +74,11 @@ def test_straight_lines_between_entries_are_within_the_accuracy() -> None:
         noisy, image.astype(np.float32), np.zeros(image.shape, np.int16),
         FlatExposures(WAVELENGTHS, 2.0 * twelve, 183.15 * twelve), "electron",
     )  # fmt: skip
-    selector = selector_of(cube, "ts8_e2v")
-    assert selector.null.probability_of_noise < 1e-9
-    assert chance_within_accuracy(selector, selector.null.fit, MODEL_ACCURACY) > SIGNIFICANCE
-    assert chance_within_accuracy(selector, selector.null.fit, 1e-6) < 1e-9
-    assert disagreement_size(selector.problem, selector.null.fit)["of_fringes"] == pytest.approx(
-        1.1e-3, rel=0.2
-    )
+    prepared = prepared_of(cube, "ts8_e2v")
+    assert total_chance(judge(prepared.null, prepared.null, index_of(prepared), RULES)) < 1e-9
+    assert chance_within(prepared, MODEL_ACCURACY) > RULES.significance
+    assert chance_within(prepared, 1e-6) < 1e-9
+    assert size_of(prepared)["of_fringes"] == pytest.approx(1.1e-3, rel=0.2)
 
 
 @pytest.mark.slow
@@ -77,8 +87,7 @@ def test_what_is_no_error_of_a_table_is_not_within_it() -> None:
         case = draw_case("outsider", np.random.default_rng(seed), size=(48, 48), only=["wandering_light"])
         if case.values["wandering_light.size"] > 0.004:
             break
-    selector = selector_of(case.cube, case.setup)
-    assert chance_within_accuracy(selector, selector.null.fit, MODEL_ACCURACY) < SIGNIFICANCE
+    assert chance_within(prepared_of(case.cube, case.setup), MODEL_ACCURACY) < RULES.significance
 
 
 def test_a_part_of_the_fringes_is_below_one() -> None:

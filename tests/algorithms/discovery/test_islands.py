@@ -1,5 +1,6 @@
 """Local effects in a search: several of them, and such as look like a step of the thickness."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
@@ -10,7 +11,10 @@ from scipy.interpolate import RectBivariateSpline
 from lsst.fringe_sim.algorithms.discovery import critics, discover
 from lsst.fringe_sim.algorithms.discovery.catalogue import Catalogue
 from lsst.fringe_sim.algorithms.discovery.critics import judge, spot_scores
+from lsst.fringe_sim.algorithms.discovery.island_places import moved_island
 from lsst.fringe_sim.algorithms.discovery.options import SearchOptions
+from lsst.fringe_sim.algorithms.discovery.preparation import prepare
+from lsst.fringe_sim.algorithms.discovery.scores import proposed
 from lsst.fringe_sim.algorithms.discovery.smooth import beside_smooth
 from lsst.fringe_sim.algorithms.discovery.window import Window
 from lsst.fringe_sim.algorithms.inference import (
@@ -24,6 +28,7 @@ from lsst.fringe_sim.algorithms.inference import (
     in_best_orders,
     relaxed,
 )
+from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry, Residuals
 from lsst.fringe_sim.effects.disc_search import find_step
 from lsst.fringe_sim.mock.thickness import random_field
@@ -177,3 +182,40 @@ def test_errors_of_single_exposures_that_follow_a_curve_are_no_draws(rng: np.ran
         (channel,) = critics._trends(cast(critics.Judged, SimpleNamespace(found=found)))
         chances.append(channel.probability)
     assert chances[0] > 1e-3 > chances[1]
+
+
+@pytest.mark.rng("an island beside its place")
+def test_an_island_moves_to_its_place_with_its_thickness(rng: np.random.Generator) -> None:
+    """A fit ends beside it, where the thickness of the cells has followed."""
+    first = point_of(rng, 0.0)
+    problem, truth = first.problem, first.problem.thickness_um
+    right = void("void", 60.0, 21.3, 16.8, 7.4)
+    noise = 0.002 * rng.standard_normal(first.value.shape)
+    data = Data(problem.forward.predict(right, truth)[0] + noise, np.full(noise.shape, 0.002**-2.0))
+    away = {**right, "void.centre_x": 22.1, "void.centre_y": 16.0}
+    point = relaxed(replace(problem, data=data).at(away, np.ones(12), truth), rounds=6)
+    (effect,) = (one for one in EFFECTS if one.name == "void")
+    moved = moved_island(effect, coordinates_of(effect, problem.forward), point)
+    assert moved is not None
+    for key in ("void.centre_x", "void.centre_y", "void.radius"):
+        assert abs(moved.settings[key] - right[key]) < 0.3
+    on = (
+        effect.coverage(
+            {key.partition(".")[2]: value for key, value in right.items()}, problem.forward.geometry
+        ).ravel()
+        > 0.0
+    )
+    assert np.abs(moved.thickness_um - truth)[on].mean() < 0.01
+    assert moved.cost < point.cost - 10.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "cause", "found"), [("outsider", "stains", False), ("one", "void", True)])
+def test_stains_are_no_islands(kind: str, cause: str, found: bool) -> None:
+    """Data with stains are farther from a void of any size than from none."""
+    case = draw_case(kind, np.random.default_rng([7, 77]).spawn(2)[0], only=[cause])
+    model, rules = FringeModel.from_setup(case.setup), SearchOptions()
+    prepared = prepare(case.cube, model, EFFECTS, rules, np.random.default_rng(5))
+    catalogue = Catalogue.of(EFFECTS, prepared.problem)
+    scored = proposed(catalogue.effects["void"], catalogue.items["void"], prepared.null)
+    assert (scored is not None and scored.gain > catalogue.price) == found

@@ -4,15 +4,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lsst.fringe_sim.algorithms.discovery.basis import CellBasis
-from lsst.fringe_sim.algorithms.discovery.fit import Coordinate, Fit, Problem, coordinates_of, fit_model
-from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from sky_frames import sky_frames_of
 
 from lsst.fringe_sim.algorithms.discovery import discover_sky
 from lsst.fringe_sim.algorithms.discovery.cells import CellData
 from lsst.fringe_sim.algorithms.discovery.next_frames import FrameForecast, laboratory_of
 from lsst.fringe_sim.algorithms.discovery.sky_search import SKY_SEARCH, SkyExposures
+from lsst.fringe_sim.algorithms.inference import (
+    CellShape,
+    Data,
+    Forward,
+    Hypothesis,
+    Problem,
+    coordinates_of,
+    fit,
+)
 from lsst.fringe_sim.algorithms.sky_response import bandpass_of
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
 from lsst.fringe_sim.instrument.sky import SkySpectrum
@@ -26,8 +32,8 @@ NAMES = ("contrast_loss", "roughness", "sky_continuum")
 
 
 @pytest.fixture(scope="module")
-def noiseless() -> tuple[Problem, dict[str, tuple[Coordinate, ...]]]:
-    """Two frames of a sensor that has lost contrast, and the coordinates of what may have been the reason."""
+def noiseless() -> Problem:
+    """Two frames of a sensor that has lost contrast."""
     model = FringeModel.from_setup("monocam")
     light = SkyExposures(
         model, SkySpectrum.dark(airmass=model.setup.airmass), bandpass_of(model), ({}, {"8-4": 0.5})
@@ -35,26 +41,32 @@ def noiseless() -> tuple[Problem, dict[str, tuple[Coordinate, ...]]]:
     thickness = random_field(SHAPE, np.random.default_rng(3), mean=14.0, span=2.5)
     y, x = (np.linspace(0.0, 479.0, size) for size in SHAPE)
     geometry = ImageGeometry((480, 480), y, x, light.wavelength_nm(), np.full(2, 1e5))
-    cells = CellData(np.ones((2, *SHAPE)), np.full((2, *SHAPE), 1e8), geometry, 1)
     catalogue = [effect for effect in EFFECTS if effect.name in NAMES]
     limits = (float(thickness.min()) - 0.5, float(thickness.max()) + 0.5)
-    forward = Forward.of_cells(model, catalogue, cells, limits, light)
-    cells = replace(cells, value=forward.predict(HIDDEN, thickness).value)
-    problem = Problem(cells, forward, CellBasis(SHAPE), np.eye(2), 1.0 / SIGMA_UM**2, thickness.ravel())
-    return problem, {effect.name: coordinates_of(effect, forward, thickness) for effect in catalogue}
+    shape = CellShape.of_field(thickness, 1)
+    forward = Forward(model, catalogue, geometry, shape, limits, exposures=light)
+    value, _ = forward.predict(HIDDEN, thickness.ravel())
+    sigma = np.full(thickness.size, SIGMA_UM)
+    data = Data(value, np.full(value.shape, 1e8))
+    return Problem(data, forward, thickness.ravel(), 1e-6, sigma, known=True)
 
 
-def fitted(problem: Problem, coordinates: tuple[Coordinate, ...]) -> Fit:
-    assert problem.field_centre is not None
-    start = np.array([item.unit_step for item in coordinates])
-    fits = [fit_model(problem, coordinates, sign * start, problem.field_centre) for sign in (1.0, -1.0)]
-    return min(fits, key=lambda fit: fit.chi2)
+def fitted(problem: Problem, name: str) -> Hypothesis:
+    """The better fit of those from either side of nothing."""
+    items, levels = coordinates_of(problem.forward.effect_of(name), problem.forward), np.ones(2)
+    fits = []
+    for sign in (1.0, -1.0):
+        settings = {item.key: item.clipped(item.null + 0.3 * sign * item.scale) for item in items}
+        start = problem.at(settings, levels, problem.thickness_um)
+        fits.append(fit((name,), items, start, tolerance=1e-6, rounds=40))
+    return min(fits, key=lambda one: one.chi2)
 
 
-def values_of(fit: Fit) -> dict[str, float]:
-    return {
-        item.parameter: item.value(place) for item, place in zip(fit.coordinates, fit.position, strict=True)
-    }
+def forecast_of(problem: Problem, best: Hypothesis) -> FrameForecast:
+    shape = (2, *SHAPE)
+    data, geometry = problem.data, problem.forward.geometry
+    cells = CellData(data.value.reshape(shape), data.weight.reshape(shape), geometry, 1)
+    return FrameForecast(best, problem.forward.model, cells)
 
 
 @pytest.mark.slow
@@ -71,11 +83,10 @@ def values_of(fit: Fit) -> dict[str, float]:
         "sky_continuum",
     ],
 )
-def test_separations_are_those_of_fits(noiseless, other: str) -> None:
-    problem, coordinates = noiseless
-    right, wrong = (fitted(problem, coordinates[name]) for name in ("contrast_loss", other))
+def test_separations_are_those_of_fits(noiseless: Problem, other: str) -> None:
+    right, wrong = (fitted(noiseless, name) for name in ("contrast_loss", other))
     assert right.chi2 < 1e-3 * wrong.chi2
-    ranked = FrameForecast(problem, right, coordinates).ranked("contrast_loss", {other: values_of(wrong)})
+    ranked = forecast_of(noiseless, right).ranked("contrast_loss", {other: wrong})
     found = {item.measurement.name: item.pairs[0] for item in ranked}
     assert set(found) == {"repeat", "hour", "laboratory"}
     expected = np.sqrt(wrong.chi2 - right.chi2)
@@ -88,14 +99,12 @@ def test_separations_are_those_of_fits(noiseless, other: str) -> None:
 
 
 @pytest.mark.slow
-def test_flats_of_the_laboratory_know_nothing_of_the_sky(noiseless) -> None:
+def test_flats_of_the_laboratory_know_nothing_of_the_sky(noiseless: Problem) -> None:
     """A cause on the sensor against one in the sky: flats show the first in full, and the second not at all."""
-    problem, coordinates = noiseless
-    right = fitted(problem, coordinates["contrast_loss"])
-    forecast = FrameForecast(problem, right, coordinates)
+    right, rival = (fitted(noiseless, name) for name in ("contrast_loss", "sky_continuum"))
     pair = next(
         item.pairs[0]
-        for item in forecast.ranked("contrast_loss", {"sky_continuum": {"scale": 1.4}})
+        for item in forecast_of(noiseless, right).ranked("contrast_loss", {"sky_continuum": rival})
         if item.measurement.name == "laboratory"
     )
     strength = [

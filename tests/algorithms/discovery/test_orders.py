@@ -1,89 +1,38 @@
 """Effects with which the thickness settles in the wrong fringe order are found in the right one."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from lsst.fringe_sim.algorithms.discovery.classes import classes_of
-from lsst.fringe_sim.algorithms.discovery.fit import Fit, Problem, fit_model
-from lsst.fringe_sim.algorithms.discovery.orders import fields_in_other_orders
-from lsst.fringe_sim.algorithms.discovery.selection import Hypothesis, Selector
 from recorded_cases import recorded_case
-from slow_cases import first_is_quick
 
-from lsst.fringe_sim.algorithms.discovery import SearchOptions
+from lsst.fringe_sim.algorithms.discovery import SearchOptions, discover
+from lsst.fringe_sim.algorithms.discovery.catalogue import Catalogue
 from lsst.fringe_sim.algorithms.discovery.preparation import Prepared, prepare, prepare_again
 from lsst.fringe_sim.algorithms.discovery.set_search import SetSearch
-from lsst.fringe_sim.challenge.sealed_cases import draw_case
-from lsst.fringe_sim.effects import EFFECTS
+from lsst.fringe_sim.algorithms.inference import Hypothesis, coordinates_of, fit
+from lsst.fringe_sim.challenge.sealed_cases import SealedCase, draw_case
+from lsst.fringe_sim.effects import EFFECTS, Effect
 from lsst.fringe_sim.model import FringeModel
 
-JITTER, CAUSE, RIVAL = "wavelength_jitter", "dark_pedestal", "contrast_loss"
-CATALOGUE = [effect for effect in EFFECTS if effect.name in (JITTER, CAUSE, RIVAL)]
-INDEX = 1.6
+RULES = SearchOptions()
 
 
-@pytest.fixture(scope="module")
-def sensor() -> tuple[Problem, Fit, np.ndarray]:
-    """Flats whose wavelengths are off one by one, behind a pedestal; fit with both known; index of the layer."""
-    case = draw_case("two", np.random.default_rng(7), size=(48, 48), only=[JITTER, CAUSE])
-    without, known = (
-        prepare(case.cube, FringeModel.from_setup("ts8_e2v", effects), CATALOGUE, 20_000)
-        for effects in ({}, case.values)
-    )
-    return replace(known.problem, forward=without.problem.forward), known.null, known.index
+def prepared_of(case: SealedCase, effects: list[Effect]) -> Prepared:
+    model = FringeModel.from_setup(case.setup)
+    return prepare(case.cube, model, effects, RULES, np.random.default_rng(5))
 
 
-def fitted_at(
-    sensor: tuple[Problem, Fit, np.ndarray], selector: Selector, field: np.ndarray, *names: str
-) -> Fit:
-    """Fit of some effects that starts from a field."""
-    problem, known, _ = sensor
-    items = tuple(item for name in names for item in selector.coordinates[name])
-    return fit_model(problem, items, np.zeros(len(items)), field, known.levels, iterations=60)
+def catalogue(*names: str) -> list[Effect]:
+    return [effect for effect in EFFECTS if effect.name in names]
 
 
-@pytest.fixture
-def selector(sensor) -> Selector:
-    problem, known, index = sensor
-    null = fit_model(problem, (), np.zeros(0), known.field, known.levels)
-    return Selector(problem, CATALOGUE, null, index)
+def search_of(prepared: Prepared, effects: list[Effect]) -> SetSearch:
+    known = Catalogue.of(effects, prepared.problem)
+    return SetSearch(known, prepared.null, RULES, lambda text: None, lambda found: False)
 
 
-def test_fields_lie_whole_orders_away(sensor) -> None:
-    problem, known, _ = sensor
-    whole = problem.basis.expand(known.field)
-    moved = [problem.basis.expand(field) for field in fields_in_other_orders(problem, known.field, INDEX)]
-    order = 1e-3 * np.median(problem.cells.wavelength_nm) / (2.0 * INDEX)
-    np.testing.assert_allclose([(each - whole).mean() / order for each in moved], [-2, -1, 1, 2], atol=0.01)
-
-
-@pytest.mark.parametrize("number", first_is_quick(range(4)))
-def test_wavelengths_that_are_off_are_found_from_another_order(sensor, selector, number: int) -> None:
-    """Each wavelength follows a wrong order by itself, to where only the ends of the spectrum tell."""
-    problem, known, _ = sensor
-    right = fitted_at(sensor, selector, known.field, CAUSE, JITTER)
-    away = fields_in_other_orders(problem, known.field, INDEX)[number]
-    wrong = fitted_at(sensor, selector, away, CAUSE, JITTER)
-    assert wrong.chi2 > right.chi2 + 50.0
-    selector.fitted[frozenset((CAUSE, JITTER))] = Hypothesis((CAUSE, JITTER), wrong, 0.0)
-    found = selector.improved((CAUSE, JITTER), wrong, scan=True)
-    assert found.fit.chi2 == pytest.approx(right.chi2, abs=2.0)
-
-
-@pytest.mark.slow
-def test_rivals_fitted_in_another_order_are_fitted_again(sensor, selector) -> None:
-    """What was compared before the right order was known says nothing."""
-    problem, known, _ = sensor
-    away = fields_in_other_orders(problem, known.field, INDEX)[1]
-    wrong = fitted_at(sensor, selector, away, JITTER, RIVAL)
-    selector.fitted[frozenset((JITTER, RIVAL))] = Hypothesis((JITTER, RIVAL), wrong, 0.0)
-    chosen = selector.hypothesis((JITTER, CAUSE), None, fitted_at(sensor, selector, known.field, JITTER))
-    classes_of(selector, chosen, 5.0)
-    rival = selector.hypothesis((JITTER, RIVAL))
-    right = fitted_at(sensor, selector, known.field, JITTER, RIVAL)
-    assert wrong.chi2 > right.chi2 + 50.0
-    assert rival.fit.chi2 == pytest.approx(right.chi2, abs=2.0)
+def best_single(prepared: Prepared, effects: list[Effect]) -> Hypothesis:
+    """The best of the effects, each by itself."""
+    return search_of(prepared, effects).larger(prepared.null)
 
 
 @pytest.mark.slow
@@ -94,12 +43,10 @@ def test_a_layer_that_is_far_off_is_found(first_seed: int) -> None:
         case = draw_case("one", np.random.default_rng(seed), only=["gate_thickness"])
         if abs(case.values["gate_thickness.offset"]) > 0.05:
             break
-    gate = [effect for effect in EFFECTS if effect.name == "gate_thickness"]
-    prepared = prepare(case.cube, FringeModel.from_setup("ts8_e2v"), gate, 20_000)
-    selector = Selector(prepared.problem, gate, prepared.null, prepared.index)
-    found = selector.improved(("gate_thickness",), prepared.null, scan=True)
-    error = found.fit.settings["gate_thickness.offset"] - case.values["gate_thickness.offset"]
-    assert abs(error) < 5.0 * max(found.fit.sigma[0], 1e-4)
+    gate = catalogue("gate_thickness")
+    found = best_single(prepared_of(case, gate), gate)
+    error = found.point.settings["gate_thickness.offset"] - case.values["gate_thickness.offset"]
+    assert abs(error) < 5.0 * max(float(np.sqrt(found.covariance[0, 0])), 1e-4)
 
 
 @pytest.mark.slow
@@ -107,61 +54,45 @@ def test_a_layer_that_is_far_off_is_found(first_seed: int) -> None:
 def test_the_deepest_of_many_minima_is_found_from_far_away(seed: int) -> None:
     """A support has fringes of its own: its index has a minimum every 0.003, and the deepest is a hundred away."""
     case = draw_case("one", np.random.default_rng(seed), size=(48, 48), only=["support_index"])
-    hidden = case.values["support_index.offset"]
-    support = [effect for effect in EFFECTS if effect.name == "support_index"]
-    prepared = prepare(case.cube, FringeModel.from_setup(case.setup), support, 20_000)
-    selector = Selector(
-        prepared.problem, support, prepared.null, prepared.index, first_field=prepared.undistorted_field
-    )
-    found = selector.hypothesis(("support_index",)).fit
-    (item,) = found.coordinates
-    assert abs(hidden) > 80 * item.neighbour
-    true = fit_model(
-        prepared.problem, (item,), np.array([item.coordinate(hidden)]), found.field, found.levels
-    )
+    hidden, support = case.values["support_index.offset"], catalogue("support_index")
+    prepared = prepared_of(case, support)
+    found = best_single(prepared, support)
+    (item,) = coordinates_of(support[0], prepared.problem.forward)
+    assert abs(hidden) > 80 * item.repeat
+    point = prepared.point
+    true = fit(("support_index",), (item,), point.moved(point.levels, point.thickness_um, {item.key: hidden}))
     assert found.chi2 < true.chi2 + 9.0
-    assert abs(found.settings[item.key] - hidden) < 2.5 * item.neighbour
+    assert abs(found.point.settings[item.key] - hidden) < 2.5 * item.repeat
 
 
 @pytest.mark.slow
 def test_a_pair_is_found_where_the_first_by_itself_was_in_another_order() -> None:
     """Insulation makes up for the wavelengths from an order away, as the thickness does: both have to move back."""
-    case, _ = recorded_case(20501129, "two", 18)
+    case, rng = recorded_case(20501129, "two", 18)
     assert set(case.names) == {"insulation", "wavelength_scale"}
-    both = [effect for effect in EFFECTS if effect.name in case.names]
-    prepared = prepare(case.cube, FringeModel.from_setup(case.setup), both, 20_000)
-    selector = Selector(
-        prepared.problem, both, prepared.null, prepared.index, first_field=prepared.undistorted_field
-    )
-    alone = selector.improved(("insulation",), prepared.null, scan=True)
-    first = selector.hypothesis(("insulation", "wavelength_scale"), None, alone.fit)
-    found = selector.improved(first.names, first.fit, scan=True)
-    assert found.fit.chi2 < first.fit.chi2 - 1000.0
-    for item, position, sigma in zip(found.fit.coordinates, found.fit.position, found.fit.sigma, strict=True):
-        assert abs(position - item.coordinate(case.values[item.key])) < 4.0 * sigma
+    verdict = discover(case.cube, case.setup, catalogue(*case.names), rng=rng)
+    assert {effect.name for effect in verdict.effects} == set(case.names), verdict.summary()
+    for effect in verdict.effects:
+        for name, found in effect.parameters.items():
+            assert abs(found.value - case.values[f"{effect.name}.{name}"]) < 4.0 * found.sigma
 
 
 @pytest.mark.slow
-def test_field_is_judged_again_with_an_effect_in_its_right_order() -> None:
-    """A gate that moves the fringes moves the thickness by three orders, which suits errors of all wavelengths."""
+def test_cells_are_judged_again_with_an_effect_in_their_right_order() -> None:
+    """A gate that moves the fringes moves the thickness by three orders."""
     case, _ = recorded_case(20461126, "two", 1)
     assert set(case.names) == {"gate_thickness", "non_linearity"}
-    prepared = prepare(case.cube, FringeModel.from_setup(case.setup), EFFECTS, 20_000)
-    selector = Selector(
-        prepared.problem, EFFECTS, prepared.null, prepared.index, first_field=prepared.undistorted_field
-    )
-    sets = SetSearch(selector, SearchOptions(), lambda text: None, lambda found: found)
-    singles = sets.refits(selector.null)
-    best = sets.to_judge_with(singles)
-    assert singles[0].names == (JITTER,)
-    assert best.names == ("gate_thickness",)
-    order = prepared.problem.forward.model.fringe_order_um(float(np.median(case.cube.wavelength_nm)))
+    prepared = prepared_of(case, list(EFFECTS))
+    found = best_single(prepared, list(EFFECTS))
+    assert found.effects == ("gate_thickness",)
+    judged = prepare_again(prepared, found, RULES)
+    order, px = prepared.problem.forward.order_um, prepared.cells.cell_px
+    rows, columns = prepared.cells.shape[1:]
+    truth = case.thickness_um[: rows * px, : columns * px].reshape(rows, px, columns, px).mean(axis=(1, 3))
 
-    def away(judged: Prepared) -> float:
-        error = judged.problem.basis.expand(judged.undistorted_field) - case.thickness_um
-        return float(np.mean(np.abs(error) > 0.5 * order))
+    def away(thickness_um: np.ndarray) -> float:
+        wrong = np.abs(thickness_um.reshape(truth.shape) - truth) > 0.5 * order
+        return float(wrong[prepared.cells.seen].mean())
 
-    refined, _ = prepare_again(prepared, best.fit, prepared.problem.basis.expand(best.fit.field))
-    assert refined is not None
-    assert away(prepared) > 0.9
-    assert away(refined) == 0.0
+    assert away(prepared.point.thickness_um) > 0.9
+    assert away(judged.free.thickness_um) == 0.0

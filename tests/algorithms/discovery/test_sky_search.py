@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from sky_frames import SHAPE, sky_frames_of
 from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.discovery import discover_sky, placement_in_frames
-from lsst.fringe_sim.algorithms.discovery.cells import CellData
 from lsst.fringe_sim.algorithms.discovery.sky_search import BeamsOverSensor, SkyExposures
 from lsst.fringe_sim.algorithms.field_response import SensorPlacement, sensor_response
+from lsst.fringe_sim.algorithms.inference import CellShape, Forward
 from lsst.fringe_sim.algorithms.sky_frame import sky_response
 from lsst.fringe_sim.algorithms.sky_response import bandpass_of
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
@@ -122,9 +121,12 @@ def test_cells_of_many_pixels_see_the_mean_of_their_beams() -> None:
     def predicted(
         geometry: ImageGeometry, size: int, field: np.ndarray, light: SkyExposures = light
     ) -> np.ndarray:
-        shape = (2, *field.shape)
-        cells = CellData(np.ones(shape), np.ones(shape), geometry, size)
-        return Forward.of_cells(base, (), cells, (12.5, 13.6), light).predict({}, field).value
+        shape, weight = CellShape.of_field(field, size), light.place_weight(geometry)
+        forward = Forward(
+            base, (), geometry, shape, (12.5, 13.6),
+            exposures=light, place_weight=weight.reshape(len(weight), -1),
+        )  # fmt: skip
+        return forward.predict({}, field.ravel())[0].reshape(2, *field.shape)
 
     def averaged(image: np.ndarray) -> np.ndarray:
         blocks = image.reshape(*image.shape[:-2], side // cell_px, cell_px, side // cell_px, cell_px)

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover, evaluations
+from lsst.fringe_sim.algorithms.discovery.evaluations import count_evaluations
+from lsst.fringe_sim.algorithms.inference import CellShape, Data, Forward, Problem, fit
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
+from lsst.fringe_sim.effects import ImageGeometry
 from lsst.fringe_sim.errors import OutOfRangeError
+from lsst.fringe_sim.model import FringeModel
 
 BUDGET_S = 100.0
 CASE = draw_case("one", np.random.default_rng(31), size=(48, 64), only=["ghost_pedestal"])
@@ -67,3 +71,22 @@ def test_a_budget_is_positive() -> None:
     with pytest.raises(OutOfRangeError, match="time budget"):
         SearchOptions(time_budget_s=-1.0)
     assert math.isinf(SearchOptions().time_budget_s)
+
+
+def test_evaluations_are_counted() -> None:
+    place, waves = np.arange(6.0), np.array([900.0, 930.0, 960.0])
+    thickness = 14.0 + 0.01 * place + 0.02 * place[:, np.newaxis]
+    geometry = ImageGeometry((6, 6), place, place, waves, np.full(3, 20_000.0))
+    forward = Forward(
+        FringeModel.from_setup("ts8_e2v"), (), geometry, CellShape.of_field(thickness, 1), (13.5, 14.7)
+    )
+    value, _ = forward.predict({}, thickness.ravel())
+    problem = Problem(Data(1.01 * value, 1e4 * np.ones(value.shape)), forward, thickness.ravel(), 1e-3)
+    point = problem.at({}, np.ones(3), thickness.ravel())
+    with count_evaluations() as count:
+        fit((), (), point)
+    with count_evaluations() as again:
+        for _ in range(2):
+            fit((), (), point)
+    assert count.number >= 1
+    assert again.number == 2 * count.number
