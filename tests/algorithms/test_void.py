@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from foreign_sky import foreign_map
-from lsst.fringe_sim.algorithms.discovery.forward import Forward
 from recorded_numbers import Record
 
 from lsst.fringe_sim.algorithms import fit_thickness, simulate_sky_frame

@@ -15,12 +15,12 @@ from lsst.fringe_sim.algorithms.discovery.channels import Channel, State, chance
 from lsst.fringe_sim.algorithms.discovery.critics import CRITICS, Judged, _undescribed, state_of
 from lsst.fringe_sim.algorithms.discovery.evaluations import count_evaluations
 from lsst.fringe_sim.algorithms.discovery.lesson import data_of
+from lsst.fringe_sim.algorithms.discovery.mending import _mend_patches
 from lsst.fringe_sim.algorithms.discovery.preparation import in_shape, prepare, prepare_again
 from lsst.fringe_sim.algorithms.discovery.set_search import SetSearch
 from lsst.fringe_sim.algorithms.discovery.start import (
     SEARCH_STEP_UM,
     _correlate,
-    _mend_patches,
     _mended,
     order_steps,
     search_template,
