@@ -87,8 +87,8 @@ def mended_thickness(cells: CellData, thickness: np.ndarray) -> np.ndarray:
     score, order = _correlate(template, cells), order_steps(model, cells)
     first = np.rint((thickness.ravel() - low) / SEARCH_STEP_UM).astype(np.int64)
     best = mended(score, first, cells, order)
-    mended = np.where(np.abs(best - first) > 0.4 * order, low + SEARCH_STEP_UM * best, thickness.ravel())
-    return np.asarray(mended.reshape(thickness.shape))
+    moved = np.where(np.abs(best - first) > 0.4 * order, low + SEARCH_STEP_UM * best, thickness.ravel())
+    return np.asarray(moved.reshape(thickness.shape))
 
 
 def test_variance_from_the_counts_no_longer_draws_a_mean_down() -> None:
