@@ -14,11 +14,11 @@ from ....effects import ImageGeometry
 from ...inference import Data, Hypothesis, Point, Problem, fit, in_best_orders, relaxed
 from ..cells import CellData
 from ..channels import State
-from ..continuation import continued
 from ..fit import Columns, PlaneColumns, Projected, Whitener
 from ..learned_columns import with_learned
 from ..learning import Part, judging_cells
 from ..outliers import spoiled_cells
+from .filled import filled
 from .preparation import Prepared, in_shape
 
 
@@ -251,7 +251,7 @@ def unseen_too(prepared: Prepared, point: Point, cells: CellData) -> Point:
         return point  # they are where it has them
     reach = 1.0
     while not known.all():
-        start = continued(point.thickness_um.reshape(shape), known).ravel()
+        start = filled(point.thickness_um.reshape(shape), known).ravel()
         near = away <= reach
         moves = (near & ~known & cells.seen).ravel()
         point = in_best_orders(point.moved(point.levels, start), moves, rounds=3)
