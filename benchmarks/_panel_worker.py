@@ -20,7 +20,7 @@ from lsst.fringe_sim.algorithms.discovery import Verdict, discover
 from ._panel_cases import PanelCase, checksum, read_cases
 
 try:
-    from lsst.fringe_sim.algorithms.discovery.evaluations import EvaluationCount, count_evaluations
+    from lsst.fringe_sim.algorithms.evaluations import EvaluationCount, count_evaluations
 except ImportError:  # a version from before the count
     count_evaluations = None  # type: ignore[assignment]
 

@@ -291,7 +291,7 @@ def test_one_cause_outside_the_catalogue_in_the_place_of_three_effects_leaves_th
         pool={frozenset(names): best},
         posterior=lambda one: one.log_evidence,
         without=lambda one, name: found(tuple(n for n in one.effects if n != name), 1e5),
-        rules=SearchOptions(),
+        options=SearchOptions(),
     )
     naming = name_effects(sets, best, 1e6, 0.5)  # type: ignore[arg-type]
     assert len(naming.effects) == number

@@ -24,7 +24,7 @@ def told_accuracy(
     null: Hypothesis,
     best: Hypothesis,
     index: FloatArray,
-    rules: SearchOptions,
+    options: SearchOptions,
     accuracy: float,
     chance: float,
 ) -> dict[str, Any]:
@@ -34,7 +34,7 @@ def told_accuracy(
     noise alone disagrees as much.
     """
     block = model_block(null.point, accuracy)
-    channels = judge(null, null, index, rules, CRITICS, block)
+    channels = judge(null, null, index, options, CRITICS, block)
     told: dict[str, Any] = {
         "assumed": accuracy,
         "source": ACCURACY_SOURCE if accuracy == MODEL_ACCURACY else "as asked for",

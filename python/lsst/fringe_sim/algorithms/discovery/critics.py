@@ -190,7 +190,7 @@ def judge(
     found: Hypothesis,
     null: Hypothesis,
     index: FloatArray,
-    rules: SearchOptions,
+    options: SearchOptions,
     critics: Sequence[Critic] = CRITICS,
     block: Columns | None = None,
 ) -> tuple[Channel, ...]:
@@ -198,28 +198,28 @@ def judge(
 
     ``block``: see `Judged`.
     """
-    judged = Judged(found, index, _undescribed(found, null, rules), block)
+    judged = Judged(found, index, _undescribed(found, null, options), block)
     return tuple(channel for critic in critics for channel in critic(judged))
 
 
-def _undescribed(found: Hypothesis, null: Hypothesis, rules: SearchOptions, fall: float = 0.0) -> float:
+def _undescribed(found: Hypothesis, null: Hypothesis, options: SearchOptions, fall: float = 0.0) -> float:
     """χ² by which the fringes may be described wrongly; ``fall``: what further effects explain."""
     response = found.point.response
     fringes = response - response.mean(axis=1, keepdims=True)
     explained = max(null.chi2 - found.chi2, 0.0) + fall
-    return rules.precision**2 * float((fringes**2).sum()) + rules.imprecision**2 * explained
+    return options.precision**2 * float((fringes**2).sum()) + options.imprecision**2 * explained
 
 
 def is_out_of_reach(
-    channels: Sequence[Channel], found: Hypothesis, null: Hypothesis, fall: float, rules: SearchOptions
+    channels: Sequence[Channel], found: Hypothesis, null: Hypothesis, fall: float, options: SearchOptions
 ) -> bool:
     """Whether something is left that is no noise, even if further effects take so much off χ².
 
     What columns explain beside an effect is what they explain without it, less what the effect explains, or more.
     """
-    noncentral = _undescribed(found, null, rules, fall)
+    noncentral = _undescribed(found, null, options, fall)
     return any(
-        chance_beyond(one.statistic - fall, max(one.degrees, 1.0), noncentral) < rules.significance
+        chance_beyond(one.statistic - fall, max(one.degrees, 1.0), noncentral) < options.significance
         for one in channels
         if one.name in PROJECTED
     )

@@ -49,18 +49,18 @@ def name_effects(sets: SetSearch, best: Hypothesis, explained: float, chance: fl
 
     ``explained``: χ² that the set takes off the unchanged model. ``chance``: of noise in what it leaves.
     """
-    rules, pool = sets.rules, list(sets.pool.values())
+    options, pool = sets.options, list(sets.pool.values())
     top = sets.posterior(best)
     weights = np.exp(np.minimum([sets.posterior(one) - top for one in pool], 0.0))
     without = {name: sets.without(best, name) for name in best.effects}
     instead = spots_instead(best, without)
-    outsider = outsider_probability(len(best.effects), chance, rules.outsider_prior, explained, instead)
+    outsider = outsider_probability(len(best.effects), chance, options.outsider_prior, explained, instead)
     named, doubts, classes = [], [], {}
     for name in best.effects:
         group = classes[name] = _class_of(sets, best, name)
         inside = np.array([bool(set(one.effects) & set(group.weights)) for one in pool])
         probability = float((weights * inside).sum() / weights.sum()) * (1.0 - outsider)
-        if probability < rules.least_probability:
+        if probability < options.least_probability:
             doubts.append(f"the class of {name} has probability {probability_text(probability)} only")
         named.append(
             NamedEffect(
@@ -78,7 +78,7 @@ def _class_of(sets: SetSearch, best: Hypothesis, name: str) -> EffectClass:
         extra = names - rest - {name}
         if rest < names and len(extra) == 1 and len(names) == len(best.effects):
             behind = best.log_evidence - one.log_evidence
-            if behind < sets.rules.class_width:
+            if behind < sets.options.class_width:
                 (other,) = extra
                 weights[other], rivals[other] = math.exp(-max(behind, 0.0)), one
     return EffectClass(weights, rivals)

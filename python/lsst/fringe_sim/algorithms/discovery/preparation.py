@@ -93,7 +93,7 @@ def prepare(
     cube: FringeCube,
     model: FringeModel,
     effects: Sequence[Effect],
-    rules: SearchOptions,
+    options: SearchOptions,
     rng: np.random.Generator,
     exposures: Exposures | None = None,
 ) -> Prepared:
@@ -103,25 +103,27 @@ def prepare(
     ``exposures``: their light, flats by default; other light is of sensors whose thickness is known.
     """
     good = np.asarray((np.asarray(cube.mask) == 0).all(axis=0))
-    held = _held_out(good, rules.heldout_fraction, rng)
-    size = finest_useful_cell(_masked(cube, held), most_cells=rules.most_cells)
-    part = SensorPart.of(good.shape, size, rules.most_cells)
+    held = _held_out(good, options.heldout_fraction, rng)
+    size = finest_useful_cell(_masked(cube, held), most_cells=options.most_cells)
+    part = SensorPart.of(good.shape, size, options.most_cells)
     if not part.inside(good.shape).all():
         held[:] = False
-        held[part.rows, part.columns] = _held_out(good[part.rows, part.columns], rules.heldout_fraction, rng)
+        held[part.rows, part.columns] = _held_out(
+            good[part.rows, part.columns], options.heldout_fraction, rng
+        )
     split = Split(cube, held, part)
-    prepared = _in_cells(split, size, model, effects, rules, exposures)
+    prepared = _in_cells(split, size, model, effects, options, exposures)
     if prepared.problem.known:
         return prepared
     turn = 2.0 * np.pi / prepared.problem.forward.order_um
     # Smaller ones than are needed may be in wrong orders, and tell nothing of larger ones.
-    while turn * _thickness_error_um(prepared.free) > rules.phase_error:
+    while turn * _thickness_error_um(prepared.free) > options.phase_error:
         size *= 2
         if min(cube.shape[1:]) // size < FEWEST_TO_HOLD_OUT:
             break
-        larger = _in_cells(split, size, model, effects, rules)
+        larger = _in_cells(split, size, model, effects, options)
         across = turn * _steepest_um(larger) * size
-        if across < rules.cell_phase and _is_likelier(larger, prepared):
+        if across < options.cell_phase and _is_likelier(larger, prepared):
             prepared = larger
     return prepared
 
@@ -200,7 +202,7 @@ def _in_cells(
     size: int,
     model: FringeModel,
     effects: Sequence[Effect],
-    rules: SearchOptions,
+    options: SearchOptions,
     exposures: Exposures | None = None,
 ) -> Prepared:
     """The same in cells of so many pixels."""
@@ -220,18 +222,18 @@ def _in_cells(
     about = point.problem.thickness_um
     problem = replace(problem, forward=point.problem.forward, thickness_um=about)
     point = with_free_contrast(problem.at({}, point.levels, about))
-    point = in_best_orders(point) if problem.known else in_whole_orders(point, rules.class_width)
+    point = in_best_orders(point) if problem.known else in_whole_orders(point, options.class_width)
     factor = np.ones(cells.shape[0])
     if not is_measured(cells.seen):
         factor += STATED_UNCERTAINTY
         cells = cells.scaled_noise(factor, cells.response_scatter)
     for _ in range(2):
         spoiled = spoiled_cells(_left(point, cells), cells.weight > 0.0)
-        cells, noise, problem = _judged(cells.restricted(~spoiled), point, rules)
+        cells, noise, problem = _judged(cells.restricted(~spoiled), point, options)
         factor = factor * noise
         start_um = point.thickness_um if problem.known else problem.thickness_um
         point = with_free_contrast(problem.at({}, point.levels, start_um), rounds=4)
-        point = _with_likelier_pixels(point, rules)
+        point = _with_likelier_pixels(point, options)
     unseen = unseen.scaled_noise(factor, cells.response_scatter)
     problem, thickness = _as_modelled(point.problem), point.thickness_um
     if problem.known:  # where the map has it, not where the judgement of the noise has moved it
@@ -241,13 +243,13 @@ def _in_cells(
     return Prepared(cells, unseen, problem, null, factor, point)
 
 
-def _with_likelier_pixels(point: Point, rules: SearchOptions) -> Point:
+def _with_likelier_pixels(point: Point, options: SearchOptions) -> Point:
     """The same with pixels that see the point in their middle, not all of their area, or the reverse, if likelier."""
     forward = point.problem.forward
     shape = replace(forward.shape, area=not forward.shape.area)
     problem = replace(point.problem, forward=replace(forward, shape=shape))
     other = with_free_contrast(problem.at(point.settings, point.levels, point.thickness_um), rounds=4)
-    return other if point.cost - other.cost > rules.class_width else point
+    return other if point.cost - other.cost > options.class_width else point
 
 
 def _as_modelled(problem: Problem) -> Problem:
@@ -266,13 +268,13 @@ def _steepest_um(prepared: Prepared) -> float:
     return float(np.quantile(np.hypot(*np.gradient(surface, cells.cell_px)), 0.95))
 
 
-def prepare_again(prepared: Prepared, found: Hypothesis, rules: SearchOptions) -> Prepared:
+def prepare_again(prepared: Prepared, found: Hypothesis, options: SearchOptions) -> Prepared:
     """Noise, and what pixels see and the thickness does within cells, as judged with effects in the model."""
     point = with_free_contrast(with_common_offset(found.point))
-    cells, noise, problem = _judged(prepared.cells, point, rules)
+    cells, noise, problem = _judged(prepared.cells, point, options)
     # What pixels see is told by slopes that are right: before, they are those of a wrong model.
     start = problem.at(point.settings, point.levels, point.thickness_um)
-    point = _with_likelier_pixels(with_free_contrast(start, rounds=4), rules)
+    point = _with_likelier_pixels(with_free_contrast(start, rounds=4), options)
     # Every fit may return to the first thickness, whatever has been fitted since.
     problem = replace(_as_modelled(point.problem), thickness_um=prepared.problem.thickness_um)
     null = problem.at({}, prepared.point.levels, prepared.point.thickness_um)
@@ -287,7 +289,7 @@ def prepare_again(prepared: Prepared, found: Hypothesis, rules: SearchOptions) -
     )
 
 
-def _judged(cells: CellData, point: Point, rules: SearchOptions) -> tuple[CellData, FloatArray, Problem]:
+def _judged(cells: CellData, point: Point, options: SearchOptions) -> tuple[CellData, FloatArray, Problem]:
     """Cells with the noise that a fit leaves, its measured over stated deviation, and the problem about the fit."""
     expected = (point.levels[:, np.newaxis] * point.value).reshape(cells.shape)
     cells = cells.with_noise_of(expected)

@@ -113,14 +113,14 @@ class Scorer:
         return Scored(name, best, degrees, step, unit, fall=max(fall, 0.0))
 
 
-def grouped(scored: Sequence[Scored], rules: SearchOptions) -> list[list[Scored]]:
+def grouped(scored: Sequence[Scored], options: SearchOptions) -> list[list[Scored]]:
     """Twins together, the best first."""
     groups: list[list[Scored]] = []
     for one in scored:
-        if one.gain <= 0.0 and len(groups) >= rules.fewest_refits:
+        if one.gain <= 0.0 and len(groups) >= options.fewest_refits:
             break
         for group in groups:
-            if abs(float(group[0].signature @ one.signature)) > rules.twin_cosine:
+            if abs(float(group[0].signature @ one.signature)) > options.twin_cosine:
                 group.append(one)
                 break
         else:

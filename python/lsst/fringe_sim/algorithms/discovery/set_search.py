@@ -26,7 +26,7 @@ class SetSearch:
 
     catalogue: Catalogue
     null: Hypothesis
-    rules: SearchOptions
+    options: SearchOptions
     say: Callable[[str], None]
     leaves_noise: Callable[[Hypothesis], bool]  # what the critics say
     pool: dict[frozenset[str], Hypothesis] = field(default_factory=dict)
@@ -56,7 +56,7 @@ class SetSearch:
         if best.effects and self._is_enough(beam[0]) and not self._is_beaten(best):
             return best
         for parent in beam[1:]:
-            self._grow(parent, most=self.rules.refits // 2)
+            self._grow(parent, most=self.options.refits // 2)
         grown = self._in_orders(size)
         if not grown:
             return best
@@ -109,7 +109,7 @@ class SetSearch:
 
     def over_valleys(self, found: Hypothesis) -> Hypothesis:
         """A set with the errors of its parameters over all valleys that the data allow."""
-        return over_valleys(found, partial(self._fit, found.effects, found.items), self.rules.class_width)
+        return over_valleys(found, partial(self._fit, found.effects, found.items), self.options.class_width)
 
     def _from_thickness(self, found: Hypothesis, other: Hypothesis) -> Hypothesis:
         """A set fitted anew from the thickness of another one."""
@@ -121,37 +121,37 @@ class SetSearch:
 
         Some cells of weak fringes lie in another minimum for every set, which says nothing about the sets.
         """
-        for one in self._of_size(len(best.effects))[: self.rules.refits]:
+        for one in self._of_size(len(best.effects))[: self.options.refits]:
             behind = self.posterior(best) - self.posterior(one)
-            if one is not best and behind < self.rules.refits * self.rules.class_width:
+            if one is not best and behind < self.options.refits * self.options.class_width:
                 self._keep(self._from_thickness(one, best))
         return self._of_size(len(best.effects))[0]
 
     def best_so_far(self) -> Hypothesis:
         """The best set that is known, none larger than what is surely better."""
         best = self.null
-        for size in range(1, self.rules.most_effects + 1):
+        for size in range(1, self.options.most_effects + 1):
             for larger in self._of_size(size)[:1]:
                 best = larger if self._is_surely_better(larger, best) else best
         return best
 
     def on(self, null: Hypothesis) -> SetSearch:
         """The same search of a problem that was judged again; the best sets are fitted from where they are."""
-        again = SetSearch(self.catalogue, null, self.rules, self.say, self.leaves_noise, pace=self.pace)
+        again = SetSearch(self.catalogue, null, self.options, self.say, self.leaves_noise, pace=self.pace)
         again._brought.update(self._brought)
         again._exchanged.update(self._exchanged)
         known = sorted(self.pool.values(), key=self.posterior, reverse=True)
         top = known[0].log_evidence - self.null.log_evidence
         # With one effect of several the noise is still that of a wrong model.
-        doubt = 1.0 - self.rules.least_of_promise if len(known[0].effects) < 2 else self.rules.imprecision
-        least = (1.0 - doubt) * top - self.rules.class_width
+        doubt = 1.0 - self.options.least_of_promise if len(known[0].effects) < 2 else self.options.imprecision
+        least = (1.0 - doubt) * top - self.options.class_width
         for number, one in enumerate(known):
             if not one.effects:
                 continue
             steps = {(frozenset(one.effects) - {name}, name) for name in one.effects}
             if one.log_evidence - self.null.log_evidence <= least:
                 again._short |= steps
-            elif number < 2 * self.rules.refits:
+            elif number < 2 * self.options.refits:
                 at = one.point
                 start = null.point.problem.at(at.settings, at.levels, at.thickness_um)
                 again._keep(again._fit(one.effects, one.items, start))
@@ -160,7 +160,7 @@ class SetSearch:
 
     def _is_surely_better(self, larger: Hypothesis, smaller: Hypothesis) -> bool:
         """Whether a larger set is as probable beside a smaller one as what is named has to be."""
-        return self.posterior(larger) - self.posterior(smaller) > self.rules.sure
+        return self.posterior(larger) - self.posterior(smaller) > self.options.sure
 
     def _is_enough(self, found: Hypothesis) -> bool:
         """Whether a set leaves noise, and no effect promises to be worth its price beside it."""
@@ -169,11 +169,11 @@ class SetSearch:
 
     def best_of(self, size: int) -> list[Hypothesis]:
         """The sets of a size that are enlarged, best first; there is one of every size below that of the best."""
-        return self._of_size(size)[: self.rules.beam]
+        return self._of_size(size)[: self.options.beam]
 
     def hoped(self, one: Scored) -> float:
         """What an effect may bring: all that it promises and little more, no larger part than where it was fitted."""
-        most = 1.0 / self.rules.least_of_promise
+        most = 1.0 / self.options.least_of_promise
         return max(one.gain, 0.0) * min(most, self._brought.get(one.name, most))
 
     def _is_beaten(self, best: Hypothesis) -> bool:
@@ -194,8 +194,8 @@ class SetSearch:
         better: list[ScoredPair] = []
         for number, pair in enumerate(sorted(pairs, key=lambda one: -one.gain)):
             names = (*base.effects, *pair.names)
-            wanted = number < self.rules.fewest_refits or any(
-                pair.is_twin_of(one, signatures, self.rules.twin_cosine) for one in better
+            wanted = number < self.options.fewest_refits or any(
+                pair.is_twin_of(one, signatures, self.options.twin_cosine) for one in better
             )
             if not wanted or frozenset(names) in self.pool:
                 continue
@@ -224,9 +224,9 @@ class SetSearch:
         problem = self.null.point.problem
         if not grown or problem.known or problem.orders or self.leaves_noise(grown[0]):
             return grown
-        for found in grown[: self.rules.beam]:
+        for found in grown[: self.options.beam]:
             point, order_um = found.point, found.point.problem.forward.order_um
-            starts = [in_whole_orders(point, self.rules.class_width)]
+            starts = [in_whole_orders(point, self.options.class_width)]
             starts += [point.moved(point.levels, point.thickness_um + t * order_um) for t in (-1.0, 1.0)]
             for start in starts:
                 if start is not point:
@@ -288,14 +288,16 @@ class SetSearch:
         ``missing``: a member of a larger set that was taken out here; its twins are refitted in any case.
         """
         key = frozenset(base.effects)
-        groups = grouped([one for one in self.scores(base) if (key, one.name) not in self._short], self.rules)
+        groups = grouped(
+            [one for one in self.scores(base) if (key, one.name) not in self._short], self.options
+        )
         worth = [group for group in groups if group[0].gain > self.catalogue.price]
-        fewest = 0 if base.effects and not missing else self.rules.fewest_refits
+        fewest = 0 if base.effects and not missing else self.options.fewest_refits
         if base is self.null and base.point.problem.levels_known and not self.leaves_noise(base):
             worth, most = groups, len(groups)  # derivatives in a wrong order promise nothing
-        number = max(fewest, min(len(worth), most or self.rules.refits))
+        number = max(fewest, min(len(worth), most or self.options.refits))
         if missing:
-            number = min(number, self.rules.fewest_refits)
+            number = min(number, self.options.fewest_refits)
         found: dict[str, Hypothesis] = {}
         self.pace.left = min(number, len(groups))
         for group in groups[:number]:
@@ -304,7 +306,7 @@ class SetSearch:
                 found[group[0].name] = self._added(base, group[0])
         if not found:
             return
-        least = max(self.posterior(one) for one in found.values()) - self.rules.class_width
+        least = max(self.posterior(one) for one in found.values()) - self.options.class_width
         for group in groups:
             first = found.get(group[0].name)
             near = missing in {one.name for one in group} or (
@@ -321,7 +323,7 @@ class SetSearch:
         ``least``: posterior from which on a set is near the best.
         """
         self.pace.left = len(group)
-        kept = self._kept(base, group) if near else self.rules.least_of_promise
+        kept = self._kept(base, group) if near else self.options.least_of_promise
         for one in group:
             if not self._may_lead(base, one, kept):
                 continue
@@ -347,14 +349,14 @@ class SetSearch:
         if one.start is not None or self.leaves_noise(best):
             return False
         start = linear_start(base, self.catalogue.items[one.name], one.step)
-        promised = 0.5 * one.fall / self.rules.least_of_promise
+        promised = 0.5 * one.fall / self.options.least_of_promise
         return start is not None and base.point.cost - start.cost > promised
 
     def _least_gain(self, base: Hypothesis, number: int) -> float:
         """What so many effects more must promise to come near the best."""
         best = max(self.posterior(known) for known in self.pool.values())
-        behind = best - self.rules.class_width - self.posterior(base) + number * self.catalogue.price
-        return self.rules.least_of_promise * behind
+        behind = best - self.options.class_width - self.posterior(base) + number * self.catalogue.price
+        return self.options.least_of_promise * behind
 
     def scores(self, base: Hypothesis) -> list[Scored]:
         """All effects that a set lacks, by what one derivative promises; best first.
@@ -375,8 +377,8 @@ class SetSearch:
 
     def _scored_at(self, point: Point, base: Hypothesis) -> list[Scored]:
         """The same by derivatives at one point; effects that propose themselves do so at that of the set."""
-        scorer = scorer_at(point, base, self.rules.sizes, base.point)
-        elsewhere = [scorer_at(one, base, self.rules.sizes) for one in in_open_orders(point)]
+        scorer = scorer_at(point, base, self.options.sizes, base.point)
+        elsewhere = [scorer_at(one, base, self.options.sizes) for one in in_open_orders(point)]
         found = []
         for name, items in self.catalogue.items.items():
             if not self.catalogue.may_add(name, base.effects):
@@ -428,9 +430,9 @@ class SetSearch:
         kept = self._is_kept(base, found, one)
         if len(items) > 1 or (kept and not items[0].repeat):
             return found
-        sizes = () if kept else self.rules.sizes
-        return fitted_elsewhere(base, found, items[0], fitted, sizes, self.rules.most_turns)
+        sizes = () if kept else self.options.sizes
+        return fitted_elsewhere(base, found, items[0], fitted, sizes, self.options.most_turns)
 
     def _is_kept(self, base: Hypothesis, found: Hypothesis, one: Scored) -> bool:
         """Whether a fit brings what derivatives promised, or little less."""
-        return found.log_evidence - base.log_evidence >= self.rules.least_of_promise * one.gain
+        return found.log_evidence - base.log_evidence >= self.options.least_of_promise * one.gain

@@ -9,7 +9,7 @@ from .scores import residuals_of
 from .set_search import SetSearch
 
 
-def told_of_steps(sets: SetSearch, found: Hypothesis, rules: SearchOptions) -> list[str]:
+def told_of_steps(sets: SetSearch, found: Hypothesis, options: SearchOptions) -> list[str]:
     """Sentences for a verdict on local effects beside which the thickness of a set steps no more.
 
     That layers do not step is knowledge that no flat holds: only what no thickness of the cells explains counts as
@@ -20,7 +20,7 @@ def told_of_steps(sets: SetSearch, found: Hypothesis, rules: SearchOptions) -> l
     told = []
     for one in sets.scores(found):
         effect = sets.catalogue.effects[one.name]
-        if one.start is None or not effect.local or one.gain < -rules.class_width:
+        if one.start is None or not effect.local or one.gain < -options.class_width:
             continue
         if find_step(residuals_of(one.start)) is None:
             values = ", ".join(

@@ -12,6 +12,7 @@ import numpy as np
 from ...effects import Effect
 from ...model import FringeModel
 from ...products.fringe_cube import FringeCube
+from ..evaluations import OutOfTimeError, time_limit
 from ..exposures import Exposures
 from ..inference import Hypothesis
 from ..next_measurement import RankedMeasurement
@@ -21,7 +22,6 @@ from .channels import Channel
 from .checks import headers_apart
 from .critics import is_out_of_reach, judge, state_of, total_chance
 from .describe import describe_residual, disagreement
-from .evaluations import OutOfTimeError, time_limit
 from .heldout import Unseen, judge_unseen, rms_unseen
 from .learning import best_evidence, learn
 from .lesson import CellLesson, CellPart, in_all_data, with_corrections
@@ -58,7 +58,7 @@ class WholeSearch:
     ) -> None:
         report("fitting the thickness with the unchanged model")
         prepared = prepare(cube, model, effects, options, rng, exposures)
-        self.prepared, self.model, self.rules, self.report = prepared, model, options, report
+        self.prepared, self.model, self.options, self.report = prepared, model, options, report
         self.rng, self.until = rng, math.inf
         # On the sky the errors of the tables are those of the map too.
         self.teaches = exposures is None and not prepared.few
@@ -73,12 +73,12 @@ class WholeSearch:
         self.sets = SetSearch(self.catalogue, prepared.null, options, report, self._leaves_noise)
 
     def _leaves_noise(self, found: Hypothesis) -> bool:
-        return total_chance(self._channels(found)) > self.rules.significance
+        return total_chance(self._channels(found)) > self.options.significance
 
     def _channels(self, found: Hypothesis) -> tuple[Channel, ...]:
         key = found, self.prepared.null
         if key not in self._judged:
-            self._judged[key] = judge(*key, self.index, self.rules)
+            self._judged[key] = judge(*key, self.index, self.options)
         return self._judged[key]
 
     @property
@@ -92,8 +92,8 @@ class WholeSearch:
         best = self._best()
         if best.effects:
             return self._concluded(best)
-        if self._chance > self.rules.significance:
-            self.notes += told_of_steps(self.sets, self.prepared.null, self.rules)
+        if self._chance > self.options.significance:
+            self.notes += told_of_steps(self.sets, self.prepared.null, self.options)
             return self._told("no_discrepancy", self.prepared.null)
         return self._unexplained(self.prepared.null, ["no effect of the catalogue explains it"])
 
@@ -111,10 +111,10 @@ class WholeSearch:
     def _best(self) -> Hypothesis:
         """The best set, found one effect at a time; noise and cells are judged with the best of every size."""
         best = self.prepared.null
-        for _ in range(self.rules.most_effects):
+        for _ in range(self.options.most_effects):
             size = len(best.effects)
             if size and all(self._is_out_of_reach(one) for one in self.sets.best_of(size)):
-                self.report(f"no set of {self.rules.most_effects} effects comes near what is left")
+                self.report(f"no set of {self.options.most_effects} effects comes near what is left")
                 break
             best = self._judged_again(self.sets.larger(best))
             if len(best.effects) <= size:
@@ -129,22 +129,22 @@ class WholeSearch:
         scored, best = self.sets.scores(found), self.sets.best_of(len(found.effects))[0]
         own = [one.signature for one in scored if one.name in best.effects]
         hoped = sorted(
-            self.sets.hoped(one) + self.sets.catalogue.price + self.rules.class_width for one in scored
-            if all(abs(float(one.signature @ other)) < self.rules.twin_cosine for other in own)
-        )[len(found.effects) - self.rules.most_effects:]  # fmt: skip
+            self.sets.hoped(one) + self.sets.catalogue.price + self.options.class_width for one in scored
+            if all(abs(float(one.signature @ other)) < self.options.twin_cosine for other in own)
+        )[len(found.effects) - self.options.most_effects:]  # fmt: skip
         fall = 2.0 * sum(hoped)
-        return is_out_of_reach(self._channels(found), found, self.prepared.null, fall, self.rules)
+        return is_out_of_reach(self._channels(found), found, self.prepared.null, fall, self.options)
 
     def _judged_again(self, best: Hypothesis) -> Hypothesis:
         """The best set once noise and slopes in the cells are those that it leaves itself."""
         if not self.prepared.measured:
             return best
-        for _ in range(self.rules.most_judged if len(best.effects) == 1 else 1):
+        for _ in range(self.options.most_judged if len(best.effects) == 1 else 1):
             if not best.effects or set(best.effects) in self._judged_with or self._is_judged_with_alike(best):
                 break
             self._judged_with.append(set(best.effects))
             self.report(f"noise and cells are judged again with {', '.join(best.effects)}")
-            prepared = prepare_again(self.prepared, best, self.rules)
+            prepared = prepare_again(self.prepared, best, self.options)
             self.sets, self.prepared = self.sets.on(prepared.null), prepared
             best = self.sets.settled(best)
         return best
@@ -154,7 +154,7 @@ class WholeSearch:
         last = self.sets.pool.get(frozenset(self._judged_with[-1])) if self._judged_with else None
         if last is None or len(last.effects) != len(best.effects):
             return False
-        return best.log_evidence - last.log_evidence < self.rules.class_width
+        return best.log_evidence - last.log_evidence < self.options.class_width
 
     # Judgement --------------------------------------------------------------------------------------------------
 
@@ -167,13 +167,13 @@ class WholeSearch:
         naming = name_effects(self.sets, self.sets.over_valleys(best), explained, total_chance(after))
         reasons: list[str] = []
         for channels in (self._channels(best), after):
-            if not reasons and total_chance(channels) < self.rules.significance:
+            if not reasons and total_chance(channels) < self.options.significance:
                 worst, names = min(channels, key=lambda one: one.probability), ", ".join(best.effects)
                 chance = chance_text(worst.probability)
                 reasons.append(f"with {names} a residual remains in '{worst.name}' (chance {chance})")
         reasons += [*self._at_ends(best), *naming.doubts]
         self.notes.append(unseen.text)
-        reasons += [why] if (why := unseen.why_not(self.rules.outsider_prior)) else []
+        reasons += [why] if (why := unseen.why_not(self.options.outsider_prior)) else []
         if reasons:
             return self._unexplained(best, reasons, naming.effects, unseen)
         form = self._what_may_be_form(best)
@@ -195,7 +195,7 @@ class WholeSearch:
         null, whole = self.prepared.null, best
         if self.prepared.unseen.seen.any():
             null, whole = in_all_data(self.prepared, best)
-        return null.chi2 - whole.chi2, judge(whole, null, self.index, self.rules)
+        return null.chi2 - whole.chi2, judge(whole, null, self.index, self.options)
 
     def _at_ends(self, best: Hypothesis) -> list[str]:
         """Parameters at an end of their range that nature does not have."""
@@ -208,13 +208,13 @@ class WholeSearch:
 
     def _what_may_be_form(self, best: Hypothesis) -> list[str]:
         """That more than noise is left, though no more than what may be wrong with the form of the effects."""
-        exact = replace(self.rules, imprecision=0.0)
+        exact = replace(self.options, imprecision=0.0)
         channels = judge(best, self.prepared.null, self.index, exact)
-        if total_chance(channels) > self.rules.significance:
+        if total_chance(channels) > self.options.significance:
             return []
         worst = min(channels, key=lambda channel: channel.probability)
         told = (
-            f"less than {self.rules.imprecision:.0%} of what {', '.join(best.effects)} explains is left in "
+            f"less than {self.options.imprecision:.0%} of what {', '.join(best.effects)} explains is left in "
             f"'{worst.name}' (chance {chance_text(worst.probability)}): its form may be wrong by as much, or a "
             "fainter effect be there"
         )
@@ -249,7 +249,7 @@ class WholeSearch:
 
         try:
             with time_limit(self.until):
-                return not_replaced(found, smaller, evidence, self.rules.sure)
+                return not_replaced(found, smaller, evidence, self.options.sure)
         except OutOfTimeError:
             return self.prepared.null
 
@@ -261,7 +261,7 @@ class WholeSearch:
         if not self.teaches:
             return {}
         self.report("learning a correction from what is left")
-        least = self.rules.sure + self.catalogue.price  # what an effect must bring
+        least = self.options.sure + self.catalogue.price  # what an effect must bring
         try:
             with time_limit(self.until):
                 learned = learn(CellLesson.of(self.prepared, found), self.rng, least)
@@ -271,12 +271,14 @@ class WholeSearch:
 
     def _accuracy(self, found: Hypothesis) -> dict[str, Any]:
         """The disagreement beside what the model may be wrong by."""
-        assumed = self.rules.model_accuracy
+        assumed = self.options.model_accuracy
         if not self.teaches or assumed == 0.0:
             return {}
         try:
             with time_limit(self.until):
-                return told_accuracy(self.prepared.null, found, self.index, self.rules, assumed, self._chance)
+                return told_accuracy(
+                    self.prepared.null, found, self.index, self.options, assumed, self._chance
+                )
         except OutOfTimeError:
             return {"assumed": assumed}
 
@@ -293,7 +295,7 @@ class WholeSearch:
         # A search that was stopped says nothing of what it did not try, and what an effect explains is no error of a
         # table.
         ended = math.isinf(self.until) and not partial
-        within = ended and accuracy.get("chance", 0.0) > self.rules.significance
+        within = ended and accuracy.get("chance", 0.0) > self.options.significance
         # What fails on data held out is like nothing.
         fails = unseen is not None and unseen.gain is not None and unseen.gain <= 0.0
         alike = self.prepared.null if within or fails else self._alike(found)
