@@ -183,7 +183,7 @@ def test_cases_of_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
     assert searched[3] == of_oracle[3]  # the same blocks are held out
     assert searched[2] is None
     assert [effect.name for effect in of_oracle[2]] == list(first.cases[1].truth)
-    assert (of_oracle[4].significance, of_oracle[4].least_evidence) == (1.0, -math.inf)
+    assert (of_oracle[4].significance, of_oracle[4].least_probability) == (1.0, 1e-6)
     assert len({each[0] for each in asked}) == 3
     again = made({"one": 3, "none": 1}, known=first.cases, progress=lambda result: told.append(result.number))
     assert told[3:] == [2]
