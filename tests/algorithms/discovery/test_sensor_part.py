@@ -33,6 +33,13 @@ def test_a_part_has_few_cells_about_the_middle(shape: tuple[int, int], cell_px: 
     assert SensorPart.of(shape, cell_px, shape[0] * shape[1]).inside(shape).all()
 
 
+@pytest.mark.parametrize("most", [1, 400])
+def test_a_part_is_never_empty(most: int) -> None:
+    part = SensorPart.of((128, 200), 1, most)
+    assert part.rows.stop - part.rows.start >= FEWEST_ROWS
+    assert part.columns.stop - part.columns.start == 64
+
+
 @pytest.mark.slow
 @pytest.mark.rng("a part of a sensor of narrow fringes")
 def test_narrow_fringes_are_searched_in_a_part(rng: np.random.Generator) -> None:

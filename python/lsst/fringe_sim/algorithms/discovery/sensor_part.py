@@ -55,7 +55,7 @@ def _middle(size: int, wanted: int) -> slice:
     """About so many pixels of a side about its middle, all of it where no more are wanted."""
     if wanted + ALIGNED_PX > size:
         return slice(0, size)
-    wanted -= wanted % ALIGNED_PX
+    wanted = max(wanted - wanted % ALIGNED_PX, ALIGNED_PX)
     first = (size - wanted) // 2
     first -= first % ALIGNED_PX
     return slice(first, first + wanted)
