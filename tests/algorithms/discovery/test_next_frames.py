@@ -9,7 +9,8 @@ from sky_frames import sky_frames_of
 from lsst.fringe_sim.algorithms.discovery import discover_sky
 from lsst.fringe_sim.algorithms.discovery.cells import CellData
 from lsst.fringe_sim.algorithms.discovery.next_frames import FrameForecast, laboratory_of
-from lsst.fringe_sim.algorithms.discovery.sky_search import SKY_SEARCH, SkyExposures
+from lsst.fringe_sim.algorithms.discovery.sky_exposures import SkyExposures
+from lsst.fringe_sim.algorithms.discovery.sky_search import SKY_SEARCH
 from lsst.fringe_sim.algorithms.inference import (
     CellShape,
     Data,

@@ -8,8 +8,9 @@ import pytest
 from recorded_numbers import Record
 from sky_frames import bright_sky, sky_frames_of
 
-from lsst.fringe_sim.algorithms.discovery import discover_sky, sky_search
-from lsst.fringe_sim.algorithms.discovery.sky_search import SKY_SEARCH, BeamsOverSensor, SkyExposures
+from lsst.fringe_sim.algorithms.discovery import discover_sky, sky_exposures
+from lsst.fringe_sim.algorithms.discovery.sky_exposures import BeamsOverSensor, SkyExposures
+from lsst.fringe_sim.algorithms.discovery.sky_search import SKY_SEARCH
 from lsst.fringe_sim.algorithms.field_response import SensorPlacement
 from lsst.fringe_sim.algorithms.sky_response import bandpass_of
 from lsst.fringe_sim.effects import EFFECTS, ImageGeometry
@@ -43,7 +44,7 @@ def test_light_in_the_beams_of_a_sensor_is_as_recorded(
     base = FringeModel.from_setup("lsst_e2v")
     cone = base.base_system.beam
     slower = SimpleNamespace(beam=lambda radius: replace(cone, theta=cone.theta * (1.0 - 0.1 * radius)))
-    monkeypatch.setattr(sky_search, "beam_field", lambda telescope: slower)
+    monkeypatch.setattr(sky_exposures, "beam_field", lambda telescope: slower)
     detector = Camera.from_name(base.setup.camera).detector("R22_S01")
     placement = SensorPlacement.of(detector, base.setup.pixel_scale_arcsec)
     field = BeamsOverSensor.of(base.setup.telescope, placement)

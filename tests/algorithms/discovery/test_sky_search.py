@@ -8,7 +8,7 @@ from sky_frames import SHAPE, sky_frames_of
 from slow_cases import first_is_quick
 
 from lsst.fringe_sim.algorithms.discovery import discover_sky, placement_in_frames
-from lsst.fringe_sim.algorithms.discovery.sky_search import BeamsOverSensor, SkyExposures
+from lsst.fringe_sim.algorithms.discovery.sky_exposures import BeamsOverSensor, SkyExposures
 from lsst.fringe_sim.algorithms.field_response import SensorPlacement, sensor_response
 from lsst.fringe_sim.algorithms.inference import CellShape, Forward
 from lsst.fringe_sim.algorithms.sky_frame import sky_response

@@ -10,8 +10,9 @@ import pytest
 from scipy.interpolate import CubicSpline
 from sky_frames import bright_sky, sky_frames_of
 
-from lsst.fringe_sim.algorithms.discovery import Verdict, discover_sky, sky_search
-from lsst.fringe_sim.algorithms.discovery.sky_search import SKY_SEARCH, BeamsOverSensor, SkyExposures
+from lsst.fringe_sim.algorithms.discovery import Verdict, discover_sky, sky_exposures
+from lsst.fringe_sim.algorithms.discovery.sky_exposures import BeamsOverSensor, SkyExposures
+from lsst.fringe_sim.algorithms.discovery.sky_search import SKY_SEARCH
 from lsst.fringe_sim.algorithms.field_response import SensorPlacement
 from lsst.fringe_sim.algorithms.inference import CellShape, Forward
 from lsst.fringe_sim.algorithms.sky_response import bandpass_of
@@ -37,7 +38,7 @@ def test_every_cell_sees_the_light_at_its_own_place(monkeypatch: pytest.MonkeyPa
     base = FringeModel.from_setup("lsst_e2v")
     cone = base.base_system.beam
     slower = SimpleNamespace(beam=lambda radius: replace(cone, theta=cone.theta * (1.0 - 0.3 * radius)))
-    monkeypatch.setattr(sky_search, "beam_field", lambda telescope: slower)
+    monkeypatch.setattr(sky_exposures, "beam_field", lambda telescope: slower)
     detector = Camera.from_name(base.setup.camera).detector("R22_S01")
     field = BeamsOverSensor.of(
         base.setup.telescope, SensorPlacement.of(detector, base.setup.pixel_scale_arcsec)
