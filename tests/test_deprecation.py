@@ -54,6 +54,27 @@ def test_a_former_argument_goes_to_the_new_one() -> None:
         assert line(960.0, 3.0) == line(960.0, width_nm=3.0) == (960.0, 3.0)
 
 
+@deprecated("1.1", "", removed_in="1.2", argument="depth")
+@deprecated("1.1", "", removed_in="1.2", argument="width")
+@dataclass(frozen=True)
+class Line:
+    """A line."""
+
+    centre_nm: float = 960.0
+
+
+def test_an_argument_that_has_no_effect_any_more_is_accepted() -> None:
+    with pytest.warns(FutureWarning, match="argument 'width' of Line .*; it has no effect"):
+        assert Line(950.0, width=5.0) == Line(950.0)
+    with pytest.warns(FutureWarning, match="depth"):
+        assert Line(depth=5.0) == Line()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert Line(950.0).centre_nm == 950.0
+    with pytest.raises(ValueError, match="must have 'nothing' in place of 'centre_nm'"):
+        deprecated("1.1", "", removed_in="1.2", argument="centre_nm")(Line)
+
+
 def test_two_names_of_one_argument_are_refused() -> None:
     with (
         pytest.warns(FutureWarning),

@@ -1,9 +1,11 @@
 """How clearly effects are seen in sealed cases."""
 
+import math
+
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.algorithms.discovery.fit import Fit
+from lsst.fringe_sim.algorithms.inference import Hypothesis
 from lsst.fringe_sim.challenge import oracle
 from lsst.fringe_sim.challenge.oracle import visibility
 from lsst.fringe_sim.challenge.sealed_cases import CASE_KINDS, SealedCase, draw_case, expose
@@ -75,13 +77,15 @@ def test_every_valley_of_the_other_effect_is_tried(
     names = ("insulation", "support_index")
     case = SealedCase(flat, "ts8_e2v", "two", names, truth, np.full((4, 4), 15.0), 1.0)
 
-    def fit_there(problem, coordinates, start, field, levels, absent) -> Fit:
-        chi2 = {0: 400.0, 2: 0.0}.get(len(coordinates), 100.0)
-        if [item.key for item in coordinates] == ["support_index.offset"]:
-            (item,) = coordinates
-            at = item.coordinate(truth[item.key]) + valley * item.neighbour
-            chi2 = 9.0 if abs(start[0] - at) < 0.1 * item.neighbour else 100.0
-        return Fit({}, tuple(coordinates), start, np.zeros(0), field, chi2, np.eye(len(coordinates)))
+    def fit_there(effects, items, start, *, aim=math.inf) -> Hypothesis:
+        chi2 = {0: 400.0, 2: 0.0}.get(len(effects), 100.0)
+        if effects == ("support_index",):
+            (item,) = items
+            away = start.settings[item.key] - (truth[item.key] + valley * item.repeat)
+            chi2 = 9.0 if abs(away) < 0.1 * item.repeat else 100.0
+        point = start.moved(start.levels, start.thickness_um)
+        vars(point)["cost"] = 0.5 * chi2  # what the point would compute of itself
+        return Hypothesis(effects, items, point, 0.0, np.eye(len(items)))
 
-    monkeypatch.setattr(oracle, "fit_model", fit_there)
+    monkeypatch.setattr(oracle, "fit", fit_there)
     assert visibility(case, most_cells=16).each["insulation"] == pytest.approx(wanted)

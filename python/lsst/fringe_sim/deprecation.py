@@ -21,15 +21,15 @@ def deprecated(
     """Let a function, a class or one argument work as before, with a warning.
 
     A function or class warns when it is called. With ``argument``, calls that pass it by keyword warn, and its value
-    goes to the argument ``instead``, which is the only one that the function still has. The docstring gets the
-    ``deprecated`` directive of numpydoc.
+    goes to the argument ``instead``, which is the only one that the function still has, or nowhere. The docstring
+    gets the ``deprecated`` directive of numpydoc.
 
     Parameters
     ----------
     since : `str`
         First version that warns.
     instead : `str`
-        Name of what takes its place.
+        Name of what takes its place; empty for an argument that has no effect any more.
     removed_in : `str`
         First version without it.
     argument : `str`, optional
@@ -54,9 +54,8 @@ def deprecated(
 
     def decorate(callee: Callee) -> Callee:
         told = f"{f'argument {argument!r} of ' if argument else ''}{callee.__qualname__}"
-        message = (
-            f"{told} is deprecated since version {since} and will be removed in {removed_in}; use {instead}"
-        )
+        end = f"use {instead}" if instead else "it has no effect"
+        message = f"{told} is deprecated since version {since} and will be removed in {removed_in}; {end}"
         kept = callee.__init__ if inspect.isclass(callee) else callee
         if argument:
             _check_names(kept, argument, instead)
@@ -70,7 +69,9 @@ def deprecated(
                     raise InputError(
                         argument, kwargs[argument], f"one value, as {instead}, its name since {since}"
                     )
-                kwargs[instead] = kwargs.pop(argument)
+                value = kwargs.pop(argument)
+                if instead:
+                    kwargs[instead] = value
             return kept(*args, **kwargs)
 
         changed: Any = with_warning
@@ -85,8 +86,8 @@ def deprecated(
 
 def _check_names(callee: Callable[..., Any], former: str, instead: str) -> None:
     parameters = inspect.signature(callee).parameters
-    if former in parameters or instead not in parameters:
-        raise ValueError(f"{callee.__qualname__} must have {instead!r} in place of {former!r}")
+    if former in parameters or (instead and instead not in parameters):
+        raise ValueError(f"{callee.__qualname__} must have {instead or 'nothing'!r} in place of {former!r}")
 
 
 def _with_directive(doc: str | None, since: str, message: str) -> str:

@@ -15,13 +15,12 @@ from lsst.fringe_sim.algorithms.discovery.channels import Channel, State, chance
 from lsst.fringe_sim.algorithms.discovery.critics import CRITICS, Judged, _undescribed, state_of
 from lsst.fringe_sim.algorithms.discovery.evaluations import count_evaluations
 from lsst.fringe_sim.algorithms.discovery.lesson import data_of
+from lsst.fringe_sim.algorithms.discovery.mending import _mend_patches, mended
 from lsst.fringe_sim.algorithms.discovery.preparation import in_shape, prepare, prepare_again
 from lsst.fringe_sim.algorithms.discovery.set_search import SetSearch
 from lsst.fringe_sim.algorithms.discovery.start import (
     SEARCH_STEP_UM,
     _correlate,
-    _mend_patches,
-    _mended,
     order_steps,
     search_template,
     starting_thickness,
@@ -87,9 +86,9 @@ def mended_thickness(cells: CellData, thickness: np.ndarray) -> np.ndarray:
     low, template = search_template(model, cells)
     score, order = _correlate(template, cells), order_steps(model, cells)
     first = np.rint((thickness.ravel() - low) / SEARCH_STEP_UM).astype(np.int64)
-    best = _mended(score, first, cells, order)
-    mended = np.where(np.abs(best - first) > 0.4 * order, low + SEARCH_STEP_UM * best, thickness.ravel())
-    return np.asarray(mended.reshape(thickness.shape))
+    best = mended(score, first, cells, order)
+    moved = np.where(np.abs(best - first) > 0.4 * order, low + SEARCH_STEP_UM * best, thickness.ravel())
+    return np.asarray(moved.reshape(thickness.shape))
 
 
 def test_variance_from_the_counts_no_longer_draws_a_mean_down() -> None:

@@ -136,3 +136,20 @@ def test_what_would_decide_is_a_frame_or_a_flat() -> None:
     assert verdict.learned == {}
     assert effect.ambiguous_with
     assert {row["measurement"] for row in verdict.next_measurements} == {"repeat", "hour", "laboratory"}
+
+
+@pytest.mark.slow
+def test_an_effect_whose_derivative_promises_too_little_is_found() -> None:
+    """Fringes grow with every degree: the derivative promises a fifth of what six degrees explain, others more."""
+    seed, settings = 12622742, {"sensor_temperature.offset": 6.0}
+    frames, known = sky_frames_of("monocam", settings, seed, 1e5)
+    catalogue = [effect for effect in EFFECTS if effect.name in (*NAMES, "oh_bands")]
+    verdict = discover_sky(
+        frames, known, MAP_UM, "monocam", catalogue,
+        rng=np.random.default_rng(seed),
+    )  # fmt: skip
+    assert verdict.verdict == "named", verdict.summary()
+    (found,) = verdict.effects
+    offset = found.parameters["offset"]
+    assert found.name == "sensor_temperature"
+    assert offset.value == pytest.approx(6.0, abs=5.0 * offset.sigma)

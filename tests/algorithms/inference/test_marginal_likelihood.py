@@ -374,3 +374,31 @@ def test_all_and_parts_of_a_sensor_are_moved_by_whole_orders(turns: str, rng: np
     # Of single cells not all are sure.
     assert (np.abs(found.thickness_um - thickness) > 0.02).mean() < (0.005 if turns == "parts" else 1e-9)
     assert (found.cost < point.cost - 100.0) == (turns != "none")
+
+
+@pytest.mark.rng("cells in false minima")
+def test_a_cell_in_a_false_minimum_goes_where_its_neighbours_are(rng: np.random.Generator) -> None:
+    """It is no whole order off, so that no move by orders leads it back; some lie at an edge or beside a mask."""
+    few, thickness = forward_of(side=24, part=0.5)
+    own, waves = few.geometry, np.arange(880.0, 991.0, 10.0)
+    geometry = ImageGeometry(own.shape, own.y_px, own.x_px, waves, np.full(len(waves), 20_000.0))
+    forward = Forward(few.model, EFFECTS, geometry, few.shape, (few.range_um[0] - 1.0, few.range_um[1] + 1.0))
+    value = forward.predict({}, thickness)[0]
+    weight = np.full((24, 24), 1e-3**-2.0)
+    weight[9, 7:10] = 0.0
+    data = Data(value + 1e-3 * rng.standard_normal(value.shape), np.tile(weight.ravel(), (len(waves), 1)))
+    away = np.zeros((24, 24))
+    away[::4, ::3] = -0.45 * forward.order_um
+    start = thickness + away.ravel()
+    point = Problem(data, forward, start, 1e-5).at({}, np.ones(len(waves)), start)
+    for _ in range(12):
+        point = point.moved(point.levels, point.thickness_um + np.clip(point.wanted_um, -0.05, 0.05))
+
+    def orders_off(found: Point) -> np.ndarray:
+        return (found.thickness_um - thickness)[data.seen] / forward.order_um
+
+    between = np.abs(orders_off(point) - np.rint(orders_off(point))) > 0.2
+    assert 5 < between.sum() < 40
+    assert np.abs(orders_off(in_whole_orders(point, 5.0))).max() < 0.05
+    known = replace(point, problem=replace(point.problem, known=True))
+    assert in_whole_orders(known, 5.0) is known

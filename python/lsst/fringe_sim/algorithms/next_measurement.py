@@ -1,17 +1,12 @@
-"""Which measurement would tell effects apart that the present flats cannot.
+"""Which measurement would tell effects apart that the present flats cannot: what could be taken, and its rank.
 
-The data are flats of a sensor whose pixels each have a thickness and a response of their own, and whose flats each
-have a level of their own; the thickness of the silicon is known up to a constant. All of that is projected out of
-what the effects do to the flats: what is left are their signatures. With the signature ``a`` of the effect that was
-found and those ``B`` of another one,
+A search projects all that is free out of what effects do to the data (`discovery.next_flats`). What is left are their
+signatures. With the signature ``a`` of the effect that was found and those ``B`` of another one,
 
     separation² = |a|² (1 - likeness²),    likeness = |projection of a on B| / |a|
 
 is the χ² by which the second effect fits worse, whatever its size: the expected difference of two fits to noiseless
-("Asimov") data, to first order. Where both have been fitted, the difference of what they do at their sizes, each at
-the thickness that suits it, takes the place of ``a`` in the separation, which is then good to second order.
-Signatures and their products (the Fisher information) add up over flats only together with the nuisances that flats
-share; so present and further flats are projected as one set.
+("Asimov") data, to first order.
 
 References
 ----------
@@ -22,17 +17,14 @@ Rao 1948 (doi 10.1017/S0305004100023987) for the projection; Cowan, Cranmer, Gro
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
-from ..effects import Effect, known_effects
-from ..errors import InputError, UnknownNameError, named_units
+from ..errors import named_units
 from ..model import FringeModel
 from .flat_series import LEVEL_E, FlatSeries
-from .measurement_forecast import Forecast, Sample, Tested
 
 HIGH_LEVEL_E = 80_000.0
 NARROW_FWHM_NM = 0.5
@@ -117,11 +109,9 @@ def candidate_measurements(
     dark_time_s: Sequence[float] = (),
 ) -> tuple[FlatMeasurement, ...]:
     """Measurements that a test stand can make besides its usual flats."""
-    return _candidates(model, _present(model, wavelength_nm, level_e, dark_time_s))
-
-
-def _candidates(model: FringeModel, present: FlatSeries) -> tuple[FlatMeasurement, ...]:
-    waves, setup = present.wavelength_nm, model.setup
+    setup = model.setup
+    waves = tuple(float(wave) for wave in (setup.wavelengths_nm if wavelength_nm is None else wavelength_nm))
+    present = FlatSeries(waves, level_e, dark_time_s=tuple(float(time) for time in dark_time_s))
     n = f"{len(waves)} flats"
     found = [
         FlatMeasurement("repeat", f"the same {n} once more", present),
@@ -149,72 +139,6 @@ def _candidates(model: FringeModel, present: FlatSeries) -> tuple[FlatMeasuremen
     return tuple(found)
 
 
-@named_units
-def rank_measurements(
-    model: FringeModel,
-    effects: Mapping[str, Mapping[str, float]],
-    present: FlatSeries | None = None,
-    *,
-    thickness_um: tuple[float, float] | None = None,
-    significance: float | None = None,
-    measurements: Sequence[FlatMeasurement] | None = None,
-    nuisance_effects: Sequence[str] = (),
-    catalogue: Sequence[Effect] | None = None,
-) -> tuple[RankedMeasurement, ...]:
-    """Rank further measurements by how well they tell apart effects that the present flats cannot.
-
-    ``model`` has the effects that are beyond doubt, without those of the class: ``effects``, fitted values by effect
-    and parameter, that which was found first. Where nothing is known (an empty mapping) an effect departs from null
-    by its prior scale if it can do so to one side only, and otherwise by little. ``present``: the flats that there
-    are, by default those of the set-up; ``thickness_um`` is by default within 1.5 of the stack's. ``significance``:
-    standard deviations by which the present data ask for the effect; without it, that of a whole sensor with photon
-    noise and nothing else unknown, which is far too good: only ratios are to be trusted. ``nuisance_effects`` are
-    known within their prior scale only, and projected out, too.
-
-    The largest separation of the hardest pair comes first. Empty if fewer than two of the effects can be forecast:
-    those that couple neighbouring pixels, or are in a part of the sensor only, cannot.
-    """
-    if model.setup.kind != "monochromator":
-        raise InputError("set-up", model.setup.name, "a laboratory set-up with a monochromator")
-    catalogue = known_effects(catalogue)
-    known = {effect.name: effect for effect in catalogue}
-    unknown = [name for name in (*effects, *nuisance_effects) if name not in known]
-    if unknown:
-        raise UnknownNameError("effect", unknown[0], known)
-    tested = [Tested.of(known[name], values, model) for name, values in effects.items()]
-    tested = [item for item in tested if item.effect.search.reach == "pixel" and not item.effect.local]
-    if len(tested) < 2:
-        return ()
-    further = [Tested.of(known[name], {}, model) for name in nuisance_effects if name not in effects]
-    flats = present or _present(model)
-    sample = Sample.of(model, thickness_um)
-    forecast = Forecast(model, catalogue, tuple(tested), tuple(further), sample, flats)
-    chosen = measurements or _candidates(model, flats)
-    # Many small matrices: threads of the linear algebra would wait for each other.
-    with threadpool_limits(limits=1, user_api="blas"):
-        return _ranked(forecast, chosen, significance)
-
-
-def _ranked(
-    forecast: Forecast, measurements: Sequence[FlatMeasurement], significance: float | None
-) -> tuple[RankedMeasurement, ...]:
-    before = forecast.pairs([forecast.present])
-    first, *others = (item.effect.name for item in forecast.tested)
-    scale = 1.0 if significance is None else significance / max(before[0].strength, 1e-300)
-    ranked = []
-    for measurement in measurements:
-        after = forecast.pairs([forecast.present, measurement.series])
-        pairs = [
-            PairForecast(
-                first, other, now.likeness, then.likeness, scale * now.separation, scale * then.separation
-            )
-            for other, now, then in zip(others, before, after, strict=True)
-        ]
-        pairs.sort(key=lambda pair: pair.separation_after)
-        ranked.append(RankedMeasurement(measurement, tuple(pairs)))
-    return tuple(sorted(ranked, key=lambda item: -item.separation))
-
-
 def break_ambiguity(ranked: Sequence[RankedMeasurement]) -> str:
     """What to measure next, in a sentence; an empty text if nothing could be forecast."""
     if not ranked:
@@ -223,15 +147,3 @@ def break_ambiguity(ranked: Sequence[RankedMeasurement]) -> str:
     if best.decides:
         return best.text
     return f"no measurement that was tried decides; the best are {best.text}"
-
-
-def _present(
-    model: FringeModel,
-    wavelength_nm: Sequence[float] | None = None,
-    level_e: float = LEVEL_E,
-    dark_time_s: Sequence[float] = (),
-) -> FlatSeries:
-    waves = model.setup.wavelengths_nm if wavelength_nm is None else wavelength_nm
-    return FlatSeries(
-        tuple(float(w) for w in waves), level_e, dark_time_s=tuple(float(time) for time in dark_time_s)
-    )

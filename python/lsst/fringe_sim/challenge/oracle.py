@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -10,12 +11,12 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from ..algorithms.discovery import Verdict
-from ..algorithms.discovery.basis import CellBasis
 from ..algorithms.discovery.cells import CellData
-from ..algorithms.discovery.fit import Fit, Problem, coordinates_of, fit_model
-from ..algorithms.discovery.preparation import prepare
+from ..algorithms.discovery.options import SearchOptions
+from ..algorithms.discovery.preparation import Prepared, prepare
+from ..algorithms.inference import CellShape, Forward, Hypothesis, Point, Problem, coordinates_of, fit, jumped
 from ..array_types import FloatArray
-from ..effects import EFFECTS
+from ..effects import EFFECTS, Effect
 from ..model import FringeModel
 from .sealed_cases import SealedCase
 
@@ -23,6 +24,9 @@ ORDERS = (0.0, -1.0, 1.0)
 """Fringe orders by which the thickness is shifted for a fit that lacks an effect: it may be likelier there."""
 
 VALLEYS = 8  # Minima on both sides that are tried for a parameter that comes back after a fringe
+
+ALL_DATA = SearchOptions(heldout_fraction=0.0)
+"""Options of a preparation that holds nothing out."""
 
 
 @dataclass(frozen=True)
@@ -44,79 +48,100 @@ class Oracle:
 def visibility(case: SealedCase, *, most_cells: int = 20_000) -> Visibility:
     """Signal to noise of the effects of a case, from fits that begin at their true sizes and the true thickness.
 
-    A search may miss a minimum that is there, and would call faint what it has missed. What is in a part of the
-    sensor only may look like a thickness that steps there: it is as clear as it is beside a thickness of each cell.
+    Its square is twice the log likelihood that the best fit without them lacks. A search may miss a minimum that is
+    there, and would call faint what it has missed. Every cell has a thickness of its own, so that what is in a part
+    of the sensor only is as clear as it is beside a thickness that steps there.
     """
-    keys = {f"{effect.name}.{parameter.name}" for effect in EFFECTS for parameter in effect.parameters}
-    # Gains of amplifiers, say, are drawn: the case knows their spread alone.
-    known = {key: value for key, value in case.values.items() if key in keys}
-    model = FringeModel.from_setup(case.setup).with_effects(known)
-    problem = prepare(case.cube, model, EFFECTS, most_cells).problem
-    thickness = _at_cells(case.thickness_um, problem.cells)
-    complete = _fit_with(problem, case, case.names, thickness)
-    order = float(model.fringe_order_um(float(np.median(problem.cells.wavelength_nm))))
+    complete = _complete(case, most_cells)
 
     @cache
-    def gain_over(names: tuple[str, ...]) -> float:
-        shifted = (_fit_with(problem, case, names, thickness + number * order) for number in ORDERS)
-        best = min(shifted, key=lambda fit: fit.chi2)
-        gain = _deepest(problem, case, names, best).chi2 - complete.chi2
-        if any(effect.local for effect in EFFECTS if effect.name in set(case.names) - set(names)):
-            gain = min(gain, beside_fine_thickness(names))
-        return math.sqrt(max(gain, 0.0))
+    def clearness_beside(names: tuple[str, ...]) -> float:
+        lost = _best_with(names, complete).point.cost - complete.point.cost
+        return math.sqrt(max(2.0 * lost, 0.0))
 
-    def beside_fine_thickness(names: tuple[str, ...]) -> float:
-        # Data without noise, which a fine thickness would follow.
-        noiseless = replace(problem.cells, value=problem.expected_of(complete))
-        fine = replace(problem.with_cells(noiseless), basis=CellBasis(noiseless.shape[1:]))
-        return _fit_with(fine, case, names, problem.basis.expand(complete.field)).chi2
+    each = {name: clearness_beside(tuple(n for n in case.names if n != name)) for name in case.names}
+    return Visibility(clearness_beside(()), each)
 
-    each = {name: gain_over(tuple(n for n in case.names if n != name)) for name in case.names}
-    return Visibility(gain_over(()), each)
+
+def _complete(case: SealedCase, most_cells: int) -> Hypothesis:
+    """The fit with all effects of a case, from their true sizes and the true thickness."""
+    effects = [effect for effect in EFFECTS if effect.name in case.names]
+    keys = {f"{effect.name}.{parameter.name}" for effect in effects for parameter in effect.parameters}
+    # Gains of amplifiers, say, are drawn: the case knows their spread alone.
+    known = {key: value for key, value in case.values.items() if key in keys}
+    model = FringeModel.from_setup(case.setup)
+    # Noise is judged with the effects in the model. Nothing is held out, so that nothing is drawn.
+    options = replace(ALL_DATA, most_cells=most_cells)
+    told = prepare(case.cube, model.with_effects(known), EFFECTS, options, np.random.default_rng(0))
+    problem = _with_free_effects(told, model, effects, _at_cells(case.thickness_um, told.cells))
+    items = tuple(item for effect in effects for item in coordinates_of(effect, problem.forward))
+    return fit(case.names, items, problem.at(known, told.point.levels, problem.thickness_um))
+
+
+def _with_free_effects(
+    told: Prepared, model: FringeModel, effects: Sequence[Effect], thickness_um: FloatArray
+) -> Problem:
+    """The problem about the true thickness ``(ny, nx)`` and a model without effects.
+
+    Its tables reach where the thickness goes without some of the effects.
+    """
+    old = told.problem.forward
+    # A phase that is larger without an effect belongs to a thickness that is smaller.
+    thicker = [-old.log_phase(_absent(effect, model)) for effect in effects]
+    low, high = old.range_um
+    low *= math.exp(math.fsum(min(part, 0.0) for part in thicker))
+    high *= math.exp(math.fsum(max(part, 0.0) for part in thicker))
+    shape = CellShape.of_field(thickness_um, told.cells.cell_px, area=old.shape.area)
+    forward = Forward(model, EFFECTS, old.geometry, shape, (low, high), old.centroid)
+    return replace(told.problem, forward=forward).about(thickness_um.ravel())
+
+
+def _absent(effect: Effect, model: FringeModel) -> dict[str, float]:
+    """Settings with which an effect does nothing."""
+    nulls = effect.null_values(model.base_system)
+    return {f"{effect.name}.{name}": value for name, value in nulls.items()}
 
 
 def _at_cells(image: FloatArray, cells: CellData) -> FloatArray:
-    """An image of the whole sensor at the middle of cells."""
+    """An image of the whole sensor in the middle of cells."""
     places = np.meshgrid(cells.geometry.y_px, cells.geometry.x_px, indexing="ij")
     return np.asarray(map_coordinates(image, places, order=1, mode="nearest"))
 
 
-def _deepest(problem: Problem, case: SealedCase, names: tuple[str, ...], fit: Fit) -> Fit:
+def _best_with(names: tuple[str, ...], complete: Hypothesis) -> Hypothesis:
+    """The best fit with some of the effects, in any of the orders and valleys that are tried."""
+    kept = tuple(item for item in complete.items if item.effect in names)
+    gone = [item for item in complete.items if item.effect not in names]
+    start = _in_own_scale(jumped(complete.point, gone, [item.null for item in gone]), complete.point)
+    aim = complete.point.cost
+    fits = (fit(names, kept, _in_order(start, number), aim=aim) for number in ORDERS)
+    return _deepest(min(fits, key=lambda one: one.point.cost), aim)
+
+
+def _in_own_scale(start: Point, complete: Point) -> Point:
+    """A start whose cells are as steep as its own thickness is, about which their prior is."""
+    old = complete.problem
+    scale = math.exp(old.forward.log_phase(complete.settings) - old.forward.log_phase(start.settings))
+    shape = old.forward.shape
+    shape = replace(shape, gradient=scale * shape.gradient, hessian=scale * shape.hessian)
+    problem = replace(old.about(scale * old.thickness_um), forward=replace(old.forward, shape=shape))
+    return problem.at(start.settings, start.levels, start.thickness_um)
+
+
+def _in_order(start: Point, number: float) -> Point:
+    """A start shifted by fringe orders, and the prior of its thickness with it."""
+    shift_um = number * start.problem.forward.order_um
+    problem = start.problem.about(start.problem.thickness_um + shift_um)
+    return problem.at(start.settings, start.levels, start.thickness_um + shift_um)
+
+
+def _deepest(found: Hypothesis, aim: float) -> Hypothesis:
     """The fit, or a better one in the valleys beside it: one effect may go there to do what another did."""
-    for number, item in enumerate(fit.coordinates):
-        for side in (-1.0, 1.0) if item.neighbour else ():
-            last = fit
+    for item in found.items:
+        for side in (-1.0, 1.0) if item.repeat else ():
+            last = found
             for _ in range(VALLEYS):
-                start = last.position.copy()
-                start[number] = item.clip(start[number] + side * item.neighbour)
-                thickness = problem.basis.expand(last.field)
-                last = _fit_with(problem, case, names, thickness, start)
-                fit = min(fit, last, key=lambda each: each.chi2)
-    return fit
-
-
-def _fit_with(
-    problem: Problem,
-    case: SealedCase,
-    names: tuple[str, ...],
-    thickness_um: FloatArray,
-    start: FloatArray | None = None,
-) -> Fit:
-    """Fit with some effects of a case, from their true sizes by default, all others absent."""
-    effects = [effect for effect in EFFECTS if effect.name in case.names]
-    absent = {
-        f"{effect.name}.{name}": null
-        for effect in effects
-        if effect.name not in names
-        for name, null in effect.null_values(problem.forward.model.base_system).items()
-    }
-    coordinates = tuple(
-        item
-        for effect in effects
-        if effect.name in names
-        for item in coordinates_of(effect, problem.forward, thickness_um)
-    )
-    if start is None:
-        start = np.array([item.coordinate(case.values.get(item.key, item.null)) for item in coordinates])
-    field = problem.basis.fit(thickness_um, problem.cells.seen.astype(float))
-    return fit_model(problem, coordinates, start, field, None, absent)
+                value = last.point.settings[item.key] + side * item.repeat
+                last = fit(found.effects, found.items, jumped(last.point, [item], [value]), aim=aim)
+                found = min(found, last, key=lambda one: one.point.cost)
+    return found

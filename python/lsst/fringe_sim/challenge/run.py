@@ -87,7 +87,7 @@ def _ask_oracle(case: SealedCase, rng: np.random.Generator) -> Oracle | None:
     known = [effect for effect in EFFECTS if effect.name in case.names]
     if not known:
         return None
-    trusting = replace(SearchOptions(), significance=1.0, least_evidence=-math.inf)
+    trusting = replace(SearchOptions(), significance=1.0, least_probability=1e-6)
     verdict = discover(case.cube, case.setup, known, rng=rng, options=trusting)
     return Oracle(visibility(case, most_cells=trusting.most_cells), verdict)
 

@@ -13,11 +13,12 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 
 from ..array_types import FloatArray
+from ..deprecation import deprecated
 from ..errors import UnknownNameError, named_units
 from ..instrument.sky import SkySpectrum
 from ..optics.system import OpticalSystem
@@ -66,6 +67,10 @@ class Parameter:
     wavelength_nm: float = math.nan
 
 
+@deprecated("1.1", "", removed_in="1.2", argument="reach")
+@deprecated("1.1", "", removed_in="1.2", argument="exact")
+@deprecated("1.1", "", removed_in="1.2", argument="hides_fringes")
+@deprecated("1.1", "", removed_in="1.2", argument="repeats_on_sky")
 @dataclass(frozen=True)
 class SearchHints:
     """What a search for missing effects must know of an effect besides its physics.
@@ -76,10 +81,6 @@ class SearchHints:
 
     Attributes
     ----------
-    reach : `str`
-        From where the signal of a pixel comes: from itself (``pixel``), also from pixels that are no farther than the
-        thickness changes evenly (``near``), or from anywhere (``far``). Scattered samples of an image show only what
-        comes from the pixel itself.
     moves_wavelengths : `bool`
         Whether all that the effect does is to move the wavelengths of exposures.
     exchangeable : `bool`
@@ -101,7 +102,6 @@ class SearchHints:
         any other may be beyond what the model is meant for.
     """
 
-    reach: Literal["pixel", "near", "far"] = "pixel"
     moves_wavelengths: bool = False
     exchangeable: bool = False
     sought: bool = False

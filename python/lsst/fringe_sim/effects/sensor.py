@@ -82,7 +82,6 @@ class ChargeDiffusion(PlainNullEffect):
     acts_on = "image"
     reference = "Lage 2019, doi 10.48550/arXiv.1911.09577 (a few um rms in 100 um of silicon)"
     parameters = (Parameter("sigma", "px", 0.0, (0.0, 5.0), 0.4, "rms radius along one axis"),)
-    search = SearchHints(reach="near")
 
     def change_image(self, image: FloatArray, values: Values, geometry: ImageGeometry) -> FloatArray:
         """Blur along both axes; exact for the band-limited image that the samples define, mirrored at the edges."""
@@ -113,7 +112,6 @@ class BrighterFatter(PlainNullEffect):
     parameters = (
         Parameter("variance", "px2", 0.0, (0.0, 0.5), 0.1, "spread along one axis behind 100 000 electrons"),
     )
-    search = SearchHints(reach="near")
 
     def change_image(self, image: FloatArray, values: Values, geometry: ImageGeometry) -> FloatArray:
         """Add the differences of the square, mirrored at the edges."""
@@ -181,7 +179,6 @@ class Crosstalk(PlainNullEffect):
             "from_right", "", 0.0, (-0.05, 0.05), 1e-3, "part of the signal of the amplifier at higher x"
         ),
     )
-    search = SearchHints(reach="far")
 
     def change_image(self, image: FloatArray, values: Values, geometry: ImageGeometry) -> FloatArray:
         """Add the neighbours, shifted by the distance of the amplifiers; all are read in the same direction."""

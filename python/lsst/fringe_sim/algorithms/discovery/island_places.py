@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.ndimage import binary_dilation
 
 from ...array_types import BoolArray
 from ...effects import Effect
 from ...errors import OutOfRangeError
-from ..inference import Coordinate, Point, in_best_orders
+from ..inference import Coordinate, Hypothesis, Point, in_best_orders
 from .window import Window
 
 STRIDES = 1.0, 0.5, 0.25
@@ -25,6 +27,18 @@ def covered(
     """Cells ``(N,)`` in which a local effect is."""
     values = {item.parameter: settings[item.key] for item in items}
     return np.asarray(effect.coverage(values, point.problem.forward.geometry).ravel() > 0.0)
+
+
+def in_best_place(
+    effect: Effect, items: tuple[Coordinate, ...], found: Hypothesis, fitted: Callable[[Point], Hypothesis]
+) -> Hypothesis:
+    """A fit with a local effect, fitted again from better places as long as that helps; ``items``: of the effect."""
+    while (start := moved_island(effect, items, found.point)) is not None:
+        new = fitted(start)
+        if new.log_evidence <= found.log_evidence:
+            break
+        found = new
+    return found
 
 
 def moved_island(effect: Effect, items: tuple[Coordinate, ...], point: Point) -> Point | None:

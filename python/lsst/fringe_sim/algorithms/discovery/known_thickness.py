@@ -10,7 +10,7 @@ from ...array_types import FloatArray
 from ..inference import Point, Problem
 from .cells import UNSTATED_UM, CellData
 
-LEAST_UM = 1e-4  # Error of the best map [µm], as in the present search
+LEAST_UM = 1e-4  # Error of the best map [µm]
 
 SHARES = np.geomspace(1e-2, 1.0, 41)
 """Errors of a map over the stated ones, of which the likeliest is taken. None is larger: a phase that is missing in

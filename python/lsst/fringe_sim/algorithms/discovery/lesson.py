@@ -14,7 +14,7 @@ from ..inference import Data, Hypothesis, Point, Problem, fit, in_best_orders, r
 from .cells import CellData
 from .channels import State
 from .columns import Columns, PlaneColumns, Projected
-from .continuation import continued
+from .continuation import filled
 from .learned_columns import with_learned
 from .learning import Part, judging_cells
 from .outliers import spoiled_cells
@@ -248,7 +248,7 @@ def unseen_too(prepared: Prepared, point: Point, cells: CellData) -> Point:
         return point  # they are where it has them
     reach = 1.0
     while not known.all():
-        start = continued(point.thickness_um.reshape(shape), known).ravel()
+        start = filled(point.thickness_um.reshape(shape), known).ravel()
         near = away <= reach
         moves = (near & ~known & cells.seen).ravel()
         point = in_best_orders(point.moved(point.levels, start), moves, rounds=3)

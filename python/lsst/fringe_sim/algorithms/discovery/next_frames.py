@@ -17,9 +17,10 @@ from ...array_types import FloatArray
 from ...model import FringeModel, Setup, setup_names
 from ..exposures import Exposures
 from ..inference import Forward, Hypothesis, Problem
-from ..measurement_forecast import RESPONSE_SCATTER
 from ..next_measurement import FlatMeasurement, FlatSeries, Measurement
 from .next_flats import FlatForecast, Seen
+
+RESPONSE_SCATTER = 0.01  # Scatter of the response of single pixels that is known beforehand (relative)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from ...deprecation import deprecated
 from ...errors import OutOfRangeError, named_units
 
 MODEL_ACCURACY = 0.014
@@ -14,6 +15,10 @@ It is that of the absorption of silicon at 1 µm. No other table of optical cons
 """
 
 
+@deprecated("1.1", "", removed_in="1.2", argument="consistency")
+@deprecated("1.1", "", removed_in="1.2", argument="least_evidence")
+@deprecated("1.1", "", removed_in="1.2", argument="credit")
+@deprecated("1.1", "", removed_in="1.2", argument="parents")
 @named_units
 @dataclass(frozen=True)
 class SearchOptions:

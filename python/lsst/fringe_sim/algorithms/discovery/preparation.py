@@ -26,7 +26,7 @@ from ..inference import (
     with_common_offset,
     with_free_contrast,
 )
-from .cells import FEWEST_TO_HOLD_OUT, CellData, bin_cube, finest_useful_cell
+from .cells import FEWEST_TO_HOLD_OUT, CellData, finest_useful_cell
 from .checks import are_few
 from .continuation import continued
 from .known_thickness import as_known, stated_sigma_um, with_error_of_map
@@ -34,6 +34,7 @@ from .neighbour_order import in_order_of_neighbours
 from .noise import STATED_UNCERTAINTY, is_measured, measured_noise, neighbour_scatter
 from .options import SearchOptions
 from .outliers import spoiled_cells
+from .sensor_part import SensorPart, told_of_part, with_edges_of_sensor
 from .start import starting_thickness
 from .surface import robust_surface
 
@@ -43,14 +44,14 @@ MARGIN_UM = 0.8
 """Thickness beyond the first one that tables cover [µm]: effects may move it by some fringe orders."""
 
 OPEN_ORDERS = 6
-"""Fringe orders on both sides in which every fit of a few pixels is tried, as in the present search."""
+"""Fringe orders on both sides in which every fit of a few pixels is tried."""
 
 FIRST_ERROR_UM = 0.004  # Error of the first thickness [µm]: it is one of steps of 0.01
 SURFACE_CELLS = 8.0  # Distance of the knots of the surface whose slope limits the size of cells [cells]
 KNOWN_UM = 1e-6  # Error of a thickness that is known [µm]
 
 NO_SCATTER, FIRST_SCATTER = 1e-6, 0.003
-"""Response scatter that is none, and what it is before it is measured (the prototype's)."""
+"""Response scatter that is none, and what it is before it is measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +85,8 @@ class Prepared:
         """What is believed and not measured, for the verdict."""
         noise = f"noise taken as stated plus {STATED_UNCERTAINTY:.0%}: too few cells to measure it"
         levels = "flat levels taken as known up to a common factor"
-        return (() if self.measured else (noise,)) + ((levels,) if self.few else ())
+        doubts = (() if self.measured else (noise,)) + ((levels,) if self.few else ())
+        return told_of_part(self.cells) + doubts
 
 
 def prepare(
@@ -103,7 +105,12 @@ def prepare(
     good = np.asarray((np.asarray(cube.mask) == 0).all(axis=0))
     held = _held_out(good, rules.heldout_fraction, rng)
     size = finest_useful_cell(_masked(cube, held), most_cells=rules.most_cells)
-    prepared = _in_cells(cube, held, size, model, effects, rules, exposures)
+    part = SensorPart.of(good.shape, size, rules.most_cells)
+    if not part.inside(good.shape).all():
+        held[:] = False
+        held[part.rows, part.columns] = _held_out(good[part.rows, part.columns], rules.heldout_fraction, rng)
+    split = Split(cube, held, part)
+    prepared = _in_cells(split, size, model, effects, rules, exposures)
     if prepared.problem.known:
         return prepared
     turn = 2.0 * np.pi / prepared.problem.forward.order_um
@@ -112,7 +119,7 @@ def prepare(
         size *= 2
         if min(cube.shape[1:]) // size < FEWEST_TO_HOLD_OUT:
             break
-        larger = _in_cells(cube, held, size, model, effects, rules)
+        larger = _in_cells(split, size, model, effects, rules)
         across = turn * _steepest_um(larger) * size
         if across < rules.cell_phase and _is_likelier(larger, prepared):
             prepared = larger
@@ -172,9 +179,24 @@ def _masked(cube: FringeCube, out: BoolArray) -> FringeCube:
     return replace(cube, mask=mask)
 
 
+@dataclass(frozen=True, eq=False)
+class Split:
+    """A cube, which of its pixels are held out, and the part of the sensor that is searched."""
+
+    cube: FringeCube
+    held: BoolArray
+    part: SensorPart
+
+    def in_cells(self, size: int) -> tuple[CellData, CellData]:
+        """What is searched and what is held out in cells of so many pixels."""
+        cells = self.part.in_cells(_masked(self.cube, self.held), size)
+        if not self.held.any():
+            return cells, cells.restricted(np.zeros(cells.shape, bool))
+        return cells, self.part.in_cells(_masked(self.cube, ~self.held), size)
+
+
 def _in_cells(
-    cube: FringeCube,
-    held: BoolArray,
+    split: Split,
     size: int,
     model: FringeModel,
     effects: Sequence[Effect],
@@ -182,10 +204,7 @@ def _in_cells(
     exposures: Exposures | None = None,
 ) -> Prepared:
     """The same in cells of so many pixels."""
-    cells = bin_cube(_masked(cube, held), size)
-    unseen = (
-        bin_cube(_masked(cube, ~held), size) if held.any() else cells.restricted(np.zeros(cells.shape, bool))
-    )
+    cells, unseen = split.in_cells(size)
     stated = cells.thickness_um
     if stated is None:
         first = continued(starting_thickness(model, cells), cells.seen)
@@ -297,7 +316,8 @@ def in_shape(point: Point, cells: CellData) -> tuple[FloatArray, CellShape]:
     # A wrong model errs in the thickness by more than noise does, and slopes that follow the errors blur fringes.
     error = max(_thickness_error_um(point), neighbour_scatter(thickness, cells.seen, 0.0))
     area = point.problem.forward.shape.area
-    return thickness, CellShape.of_field(thickness, cells.cell_px, error, area=area)
+    shape = CellShape.of_field(thickness, cells.cell_px, error, area=area)
+    return thickness, with_edges_of_sensor(shape, cells)
 
 
 def _left(point: Point, cells: CellData) -> FloatArray:
@@ -331,7 +351,7 @@ def _problem(
 ) -> Problem:
     """Problem about a first thickness ``(ny, nx)``; a few pixels hardly tell levels and fringe order."""
     error = FIRST_ERROR_UM if cells.thickness_um is None else float(np.median(stated_sigma_um(cells)))
-    shape = CellShape.of_field(thickness_um, cells.cell_px, error)
+    shape = with_edges_of_sensor(CellShape.of_field(thickness_um, cells.cell_px, error), cells)
     orders = OPEN_ORDERS if few and cells.thickness_um is None else 0
     margin = MARGIN_UM + orders * float(model.fringe_order_um(np.median(cells.wavelength_nm)))
     limits = (max(float(thickness_um.min()) - margin, 0.05), float(thickness_um.max()) + margin)

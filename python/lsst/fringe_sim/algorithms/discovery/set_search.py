@@ -5,31 +5,19 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
-import numpy as np
-
-from ...array_types import FloatArray
-from ..inference import (
-    Coordinate,
-    Hypothesis,
-    fit,
-    in_open_orders,
-    in_whole_orders,
-    jumped,
-    led,
-)
+from ..inference import Coordinate, Hypothesis, fit, in_open_orders, in_whole_orders, jumped, led
 from ..inference.marginal import Point
 from .catalogue import Catalogue
-from .island_places import moved_island
+from .island_places import in_best_place
 from .open_orders import best_of_orders, scorer_at
 from .options import SearchOptions
 from .pace import Pace
 from .pairs import Joint, ScoredPair
 from .scores import Scored, best_gain, grouped, proposed
-from .starts import best_start, part_of, without_keys
-
-PARTS = 1.0, 0.3
-"""Parts of a linear step of several parameters from which they are fitted: the whole may lead too far."""
+from .starts import fitted_elsewhere, linear_start, without_keys
+from .valleys import in_deepest_valleys, over_valleys
 
 
 @dataclass(eq=False)
@@ -50,8 +38,8 @@ class SetSearch:
         self._joints: dict[frozenset[str], list[Joint]] = {}
         self._added_before: set[tuple[frozenset[str], str]] = set()
         self._short: set[tuple[frozenset[str], str]] = set()  # fits that came far behind before
-        # largest part of its promise that an effect brought where it was fitted
-        self._brought: dict[str, float] = {}
+        self._brought: dict[str, float] = {}  # largest part of its promise that an effect brought in a fit
+        self._deepest: set[Hypothesis] = set()  # sets in the best of their valleys
         self._exchanged: set[frozenset[str]] = set()  # sets whose members were left out and exchanged
 
     def posterior(self, found: Hypothesis) -> float:
@@ -98,6 +86,7 @@ class SetSearch:
 
         What it brings else is that cells or parameters lie in other minima, which they may without it.
         """
+        larger = self._in_deepest_valleys(larger)
         if smaller.effects and self._is_surely_better(larger, smaller):
             others = [self._from_thickness(smaller, larger)]
             others += [
@@ -110,6 +99,17 @@ class SetSearch:
                 # It may be what is left of a larger one, with twins that are not fitted.
                 smaller = self._settled(smaller)
         return larger if self._is_surely_better(larger, smaller) else smaller
+
+    def _in_deepest_valleys(self, found: Hypothesis) -> Hypothesis:
+        """A set with its parameters that repeat where they are the best beside all of its effects."""
+        if found not in self._deepest:
+            found = self._keep(in_deepest_valleys(found, partial(self._fit, found.effects, found.items)))
+            self._deepest.add(found)
+        return found
+
+    def over_valleys(self, found: Hypothesis) -> Hypothesis:
+        """A set with the errors of its parameters over all valleys that the data allow."""
+        return over_valleys(found, partial(self._fit, found.effects, found.items), self.rules.class_width)
 
     def _from_thickness(self, found: Hypothesis, other: Hypothesis) -> Hypothesis:
         """A set fitted anew from the thickness of another one."""
@@ -188,8 +188,7 @@ class SetSearch:
         if not self.catalogue.may_leave((name,), found.effects):
             return
         base = self.without(found, name)
-        signatures = {one.name: one.signature for one in self.scores(base)}
-        least = self._least_gain(base, 2)
+        signatures, least = {one.name: one.signature for one in self.scores(base)}, self._least_gain(base, 2)
         joints = self._joints[frozenset(base.effects)]
         pairs = [pair for joint in joints for pair in joint.best_pairs(best_gain, least, (name,))]
         better: list[ScoredPair] = []
@@ -207,7 +206,7 @@ class SetSearch:
     def _pair_added(self, base: Hypothesis, pair: ScoredPair, names: tuple[str, ...]) -> Hypothesis:
         """The set with two effects more."""
         items = tuple(item for one in pair.names for item in self.catalogue.items[one])
-        start = best_start(base, items, [part_of(items, pair.step, part) for part in PARTS])
+        start = linear_start(base, items, pair.step)
         both = self._fit(names, (*base.items, *items), base.point if start is None else start)
         brings = both.log_evidence - base.log_evidence
         self.say(f"  {'+'.join(names)}: promised {pair.gain:.1f} together, brings {brings:.1f}")
@@ -215,8 +214,9 @@ class SetSearch:
 
     def _of_size(self, size: int) -> list[Hypothesis]:
         """All sets of so many effects, best first."""
-        found = [one for one in self.pool.values() if len(one.effects) == size]
-        return sorted(found, key=self.posterior, reverse=True)
+        return sorted(
+            (h for h in self.pool.values() if len(h.effects) == size), key=self.posterior, reverse=True
+        )
 
     def _in_orders(self, size: int) -> list[Hypothesis]:
         """All sets of so many effects, the best of them in other fringe orders too where none leaves noise."""
@@ -227,9 +227,7 @@ class SetSearch:
         for found in grown[: self.rules.beam]:
             point, order_um = found.point, found.point.problem.forward.order_um
             starts = [in_whole_orders(point, self.rules.class_width)]
-            starts += [
-                point.moved(point.levels, point.thickness_um + turn * order_um) for turn in (-1.0, 1.0)
-            ]
+            starts += [point.moved(point.levels, point.thickness_um + t * order_um) for t in (-1.0, 1.0)]
             for start in starts:
                 if start is not point:
                     self._keep(self._fit(found.effects, found.items, start))
@@ -292,8 +290,6 @@ class SetSearch:
         key = frozenset(base.effects)
         groups = grouped([one for one in self.scores(base) if (key, one.name) not in self._short], self.rules)
         worth = [group for group in groups if group[0].gain > self.catalogue.price]
-        if base.effects and not missing:
-            worth = [group for group in worth if self._may_lead(base, group[0])]
         fewest = 0 if base.effects and not missing else self.rules.fewest_refits
         if base is self.null and base.point.problem.levels_known and not self.leaves_noise(base):
             worth, most = groups, len(groups)  # derivatives in a wrong order promise nothing
@@ -303,7 +299,8 @@ class SetSearch:
         found: dict[str, Hypothesis] = {}
         self.pace.left = min(number, len(groups))
         for group in groups[:number]:
-            if self._may_lead(base, group[0]) or len(found) < fewest or worth is groups:
+            wanted = self._may_lead(base, group[0]) or len(found) < fewest or worth is groups
+            if wanted or (not missing and self._is_underrated(base, group[0])):
                 found[group[0].name] = self._added(base, group[0])
         if not found:
             return
@@ -340,6 +337,18 @@ class SetSearch:
     def _may_lead(self, base: Hypothesis, one: Scored, kept: float = 1.0) -> bool:
         """Whether a set with one effect more comes near the best, if derivatives promise all but a part."""
         return kept * one.gain > self._least_gain(base, 1)
+
+    def _is_underrated(self, base: Hypothesis, one: Scored) -> bool:
+        """Whether an effect explains more at its linear step than derivatives promise, where more than noise is left.
+
+        The fringes of a sensor whose absorption falls grow with every degree: what the fit brings is not known then.
+        """
+        best = max(self.pool.values(), key=self.posterior)
+        if one.start is not None or self.leaves_noise(best):
+            return False
+        start = linear_start(base, self.catalogue.items[one.name], one.step)
+        promised = 0.5 * one.fall / self.rules.least_of_promise
+        return start is not None and base.point.cost - start.cost > promised
 
     def _least_gain(self, base: Hypothesis, number: int) -> float:
         """What so many effects more must promise to come near the best."""
@@ -405,41 +414,22 @@ class SetSearch:
         """The fit from what an effect proposes; of an island from the best place about that, too."""
         assert one.start is not None
         found, effect = self._fit(names, items, one.start), self.catalogue.effects[one.name]
-        own = self.catalogue.items[one.name]
-        start = moved_island(effect, own, found.point) if effect.local else None
-        while start is not None:
-            new = self._fit(names, items, start)
-            if new.log_evidence <= found.log_evidence:
-                break
-            found, start = new, moved_island(effect, own, new.point)
-        return found
+        if not effect.local:
+            return found
+        return in_best_place(effect, self.catalogue.items[one.name], found, partial(self._fit, names, items))
 
     def _fitted(
         self, base: Hypothesis, one: Scored, names: tuple[str, ...], items: tuple[Coordinate, ...]
     ) -> Hypothesis:
         """The fit from the linear step; from elsewhere where that does not bring what it promised, or repeats."""
-        every = (*base.items, *items)
-        parts = PARTS[:1] if len(items) == 1 else PARTS
-        first = best_start(base, items, [part_of(items, one.step, part) for part in parts])
-        found = self._fit(names, every, base.point if first is None else first)
+        fitted = partial(self._fit, names, (*base.items, *items))
+        first = linear_start(base, items, one.step)
+        found = fitted(base.point if first is None else first)
         kept = self._is_kept(base, found, one)
         if len(items) > 1 or (kept and not items[0].repeat):
             return found
-        (item,) = items
-        tried: list[FloatArray] = []
-        if not kept:
-            sides = (item.side,) if item.side else (1.0, -1.0)
-            tried += [np.array([item.null + s * x * item.scale]) for s in sides for x in self.rules.sizes]
-        for _ in range(self.rules.most_turns if item.repeat else 1):
-            if item.repeat:
-                value = found.point.settings[item.key]
-                tried += [np.array([value + turn * item.repeat]) for turn in (-1.0, 1.0)]
-            other = best_start(base, items, tried)
-            new = found if other is None else self._fit(names, every, other)
-            if new.log_evidence <= found.log_evidence:
-                break
-            found, tried = new, []
-        return found
+        sizes = () if kept else self.rules.sizes
+        return fitted_elsewhere(base, found, items[0], fitted, sizes, self.rules.most_turns)
 
     def _is_kept(self, base: Hypothesis, found: Hypothesis, one: Scored) -> bool:
         """Whether a fit brings what derivatives promised, or little less."""

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from ...array_types import FloatArray
 from ...errors import OutOfRangeError
 from ..inference import Coordinate, Hypothesis, Point, jumped
+
+PARTS = 1.0, 0.3
+"""Parts of a linear step of several parameters from which they are fitted: the whole may lead too far."""
 
 
 def best_start(base: Hypothesis, items: tuple[Coordinate, ...], tried: Sequence[FloatArray]) -> Point | None:
@@ -24,9 +27,38 @@ def best_start(base: Hypothesis, items: tuple[Coordinate, ...], tried: Sequence[
     return best
 
 
-def part_of(items: Sequence[Coordinate], step: FloatArray, part: float) -> FloatArray:
-    """Values of parameters after a part of a step from null."""
-    return np.array([item.null for item in items]) + part * step
+def linear_start(base: Hypothesis, items: tuple[Coordinate, ...], step: FloatArray) -> Point | None:
+    """Where a linear step of parameters from null leads, or nothing if that is not better."""
+    parts = PARTS[:1] if len(items) == 1 else PARTS
+    null = np.array([item.null for item in items])
+    return best_start(base, items, [null + part * step for part in parts])
+
+
+def fitted_elsewhere(
+    base: Hypothesis,
+    found: Hypothesis,
+    item: Coordinate,
+    fitted: Callable[[Point], Hypothesis],
+    sizes: Sequence[float],
+    turns: int,
+) -> Hypothesis:
+    """The fit of an effect of one parameter, or the better one from elsewhere.
+
+    ``sizes``: departures from null that are tried, in prior scales. ``turns``: repeats by which the fit goes on, as
+    long as each brings more.
+    """
+    sides = (item.side,) if item.side else (1.0, -1.0)
+    tried = [np.array([item.null + side * size * item.scale]) for side in sides for size in sizes]
+    for _ in range(turns if item.repeat else 1):
+        if item.repeat:
+            value = found.point.settings[item.key]
+            tried += [np.array([value + turn * item.repeat]) for turn in (-1.0, 1.0)]
+        other = best_start(base, (item,), tried)
+        new = found if other is None else fitted(other)
+        if new.log_evidence <= found.log_evidence:
+            break
+        found, tried = new, []
+    return found
 
 
 def without_keys(point: Point, keys: set[str]) -> Point:

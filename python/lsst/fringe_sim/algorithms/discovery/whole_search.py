@@ -164,7 +164,7 @@ class WholeSearch:
         self.report(f"data held out are asked about {', '.join(best.effects)}")
         unseen = judge_unseen(self.prepared, best)
         explained, after = self._left_in_all_data(best)
-        naming = name_effects(self.sets, best, explained, total_chance(after))
+        naming = name_effects(self.sets, self.sets.over_valleys(best), explained, total_chance(after))
         reasons: list[str] = []
         for channels in (self._channels(best), after):
             if not reasons and total_chance(channels) < self.rules.significance:

@@ -10,7 +10,7 @@ from ...array_types import FloatArray
 from .marginal import Point, kept
 
 OFFSETS = np.arange(-18, 19) / 12.0
-"""Moves of the thickness that are tried [orders]: as far as the present search lets it follow an effect."""
+"""Moves of the thickness that are tried [orders]: an effect may shift the fringes by one and a half."""
 
 
 @kept(8)

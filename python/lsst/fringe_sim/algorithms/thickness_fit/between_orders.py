@@ -116,7 +116,7 @@ def _join_row(  # type: ignore[no-untyped-def]
         if not np.isfinite(own):
             continue
         number = _where_neighbours_have_it(thickness, rise_y, rise_x, y, x, near)
-        price, jump = _breaks(near, number, own, order)
+        price, jump = _breaks(near, number, np.float64(own), order)
         if jump <= SAME_SURFACE * order:
             continue
         freedom = degrees_of_freedom(weight, x)
