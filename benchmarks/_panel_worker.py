@@ -20,8 +20,8 @@ from lsst.fringe_sim.algorithms.discovery import Verdict, discover
 from ._panel_cases import PanelCase, checksum, read_cases
 
 try:
-    from lsst.fringe_sim.algorithms.discovery.evaluations import EvaluationCount, count_evaluations
-except ImportError:  # a version from before the count
+    from lsst.fringe_sim.algorithms.evaluations import EvaluationCount, count_evaluations
+except ImportError:  # a version that does not count, or does it elsewhere
     count_evaluations = None  # type: ignore[assignment]
 
 GRACE_S = 20

@@ -13,7 +13,6 @@ from lsst.fringe_sim.algorithms.discovery.catalogue import Catalogue
 from lsst.fringe_sim.algorithms.discovery.cells import CellData, bin_cube, finest_useful_cell
 from lsst.fringe_sim.algorithms.discovery.channels import Channel, State, chance_beyond, echo_channel
 from lsst.fringe_sim.algorithms.discovery.critics import CRITICS, Judged, _undescribed, state_of
-from lsst.fringe_sim.algorithms.discovery.evaluations import count_evaluations
 from lsst.fringe_sim.algorithms.discovery.lesson import data_of
 from lsst.fringe_sim.algorithms.discovery.mending import _mend_patches, mended
 from lsst.fringe_sim.algorithms.discovery.preparation import in_shape, prepare, prepare_again
@@ -25,6 +24,7 @@ from lsst.fringe_sim.algorithms.discovery.start import (
     search_template,
     starting_thickness,
 )
+from lsst.fringe_sim.algorithms.evaluations import count_evaluations
 from lsst.fringe_sim.algorithms.inference import (
     CellShape,
     Forward,

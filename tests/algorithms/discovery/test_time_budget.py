@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover, evaluations
-from lsst.fringe_sim.algorithms.discovery.evaluations import count_evaluations
+from lsst.fringe_sim.algorithms import evaluations
+from lsst.fringe_sim.algorithms.discovery import SearchOptions, Verdict, discover
+from lsst.fringe_sim.algorithms.evaluations import count_evaluations
 from lsst.fringe_sim.algorithms.inference import CellShape, Data, Forward, Problem, fit
 from lsst.fringe_sim.challenge.sealed_cases import draw_case
 from lsst.fringe_sim.effects import ImageGeometry

@@ -14,9 +14,9 @@ from ...effects import Effect, known_effects
 from ...model import FringeModel, Setup
 from ...products.fringe_cube import FringeCube
 from ...products.sky_frame import refuse_noiseless
+from ..evaluations import OutOfTimeError, time_limit
 from ..exposures import Exposures
 from .checks import check_setup, why_too_poor
-from .evaluations import OutOfTimeError, time_limit
 from .options import SearchOptions
 from .verdict import Gap, Verdict, Where
 from .verdict_words import METRIC

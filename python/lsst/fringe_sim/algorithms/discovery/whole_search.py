@@ -12,6 +12,7 @@ import numpy as np
 from ...effects import Effect
 from ...model import FringeModel
 from ...products.fringe_cube import FringeCube
+from ..evaluations import OutOfTimeError, time_limit
 from ..exposures import Exposures
 from ..inference import Hypothesis
 from ..next_measurement import RankedMeasurement
@@ -21,7 +22,6 @@ from .channels import Channel
 from .checks import headers_apart
 from .critics import is_out_of_reach, judge, state_of, total_chance
 from .describe import describe_residual, disagreement
-from .evaluations import OutOfTimeError, time_limit
 from .heldout import Unseen, judge_unseen, rms_unseen
 from .learning import best_evidence, learn
 from .lesson import CellLesson, CellPart, in_all_data, with_corrections

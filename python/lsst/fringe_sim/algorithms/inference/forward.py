@@ -18,7 +18,7 @@ from ...effects.active import ActiveEffect, another
 from ...model import FringeModel
 from ...optics.illumination import Illumination
 from ...optics.phase_response import PhaseResponse
-from ..discovery.evaluations import note_evaluation
+from ..evaluations import note_evaluation
 from ..exposures import Exposures
 from .cell_average import CellShape, look_up
 
