@@ -6,7 +6,7 @@ from recorded_cases import recorded_case
 
 from lsst.fringe_sim.algorithms.discovery import SearchOptions, discover
 from lsst.fringe_sim.algorithms.discovery.catalogue import Catalogue
-from lsst.fringe_sim.algorithms.discovery.preparation import Prepared, prepare, prepare_again
+from lsst.fringe_sim.algorithms.discovery.preparation import Prepared, prepare
 from lsst.fringe_sim.algorithms.discovery.set_search import SetSearch
 from lsst.fringe_sim.algorithms.inference import Hypothesis, coordinates_of, fit
 from lsst.fringe_sim.challenge.sealed_cases import SealedCase, draw_case
@@ -61,7 +61,7 @@ def test_the_deepest_of_many_minima_is_found_from_far_away(seed: int) -> None:
     assert abs(hidden) > 80 * item.repeat
     point = prepared.point
     true = fit(("support_index",), (item,), point.moved(point.levels, point.thickness_um, {item.key: hidden}))
-    assert found.chi2 < true.chi2 + 9.0
+    assert found.point.cost < true.point.cost + 4.5
     assert abs(found.point.settings[item.key] - hidden) < 2.5 * item.repeat
 
 
@@ -78,21 +78,12 @@ def test_a_pair_is_found_where_the_first_by_itself_was_in_another_order() -> Non
 
 
 @pytest.mark.slow
-def test_cells_are_judged_again_with_an_effect_in_their_right_order() -> None:
-    """A gate that moves the fringes moves the thickness by three orders."""
-    case, _ = recorded_case(20461126, "two", 1)
+def test_a_pair_is_found_of_which_one_moves_the_thickness_by_orders() -> None:
+    """A gate that moves the fringes moves the thickness by three orders, which suits errors of all wavelengths."""
+    case, rng = recorded_case(20461126, "two", 1)
     assert set(case.names) == {"gate_thickness", "non_linearity"}
-    prepared = prepared_of(case, list(EFFECTS))
-    found = best_single(prepared, list(EFFECTS))
-    assert found.effects == ("gate_thickness",)
-    judged = prepare_again(prepared, found, RULES)
-    order, px = prepared.problem.forward.order_um, prepared.cells.cell_px
-    rows, columns = prepared.cells.shape[1:]
-    truth = case.thickness_um[: rows * px, : columns * px].reshape(rows, px, columns, px).mean(axis=(1, 3))
-
-    def away(thickness_um: np.ndarray) -> float:
-        wrong = np.abs(thickness_um.reshape(truth.shape) - truth) > 0.5 * order
-        return float(wrong[prepared.cells.seen].mean())
-
-    assert away(prepared.point.thickness_um) > 0.9
-    assert away(judged.free.thickness_um) == 0.0
+    verdict = discover(case.cube, case.setup, rng=rng)
+    classes = [{effect.name, *effect.ambiguous_with} for effect in verdict.effects]
+    assert len(classes) == 2, verdict.summary()
+    assert any("gate_thickness" in names for names in classes)
+    assert any("non_linearity" in names for names in classes)
