@@ -163,30 +163,3 @@ def test_gaps_of_a_void_are_tried_until_the_fringes_come_back(rng: np.random.Gen
     (void,) = (effect for effect in EFFECTS if effect.name == "void")
     sizes = [start["thickness"] for start in void.propose(residuals_of(rng, 2, 3.0))]
     assert sizes == pytest.approx([470.0 * number / 12 for number in range(1, 13)])
-
-
-@pytest.mark.parametrize(("strength", "counts"), [(0.19, False), (0.21, True), (2.99, True), (3.01, False)])
-def test_a_signature_may_be_scaled_a_little(strength: float, counts: bool) -> None:
-    """What a disc promises is the square of what was measured over its variance."""
-    information = np.ones((20, 20))
-    fall, row, column, radius = Discs.of(information > 0.0).best(strength * information, information)
-    if not counts:
-        assert (fall, row, column, radius) == (0.0, 0.0, 0.0, 2.0)
-        return
-    cells = (np.hypot(*(np.indices((21, 21)) - 10.0)) <= 2.0 * 1.2**6).sum()
-    assert radius == pytest.approx(2.0 * 1.2**6)
-    assert fall == pytest.approx(strength**2 * cells)
-    assert min(row, column) >= 5.0
-    assert max(row, column) <= 14.0
-
-
-@pytest.mark.parametrize(("part", "counts"), [(0.7e-6, False), (1.5e-6, True)])
-def test_a_disc_without_information_promises_nothing(part: float, counts: bool) -> None:
-    """One that has less than a millionth of all, however strongly it says so."""
-    cells = (np.hypot(*(np.indices((21, 21)) - 10.0)) <= 2.0 * 1.2**6).sum()
-    information = np.ones((20, 40))
-    information[:, 20:] = 400.0 * part / cells
-    score = np.where(information < 1.0, information, 0.0)
-    found = Discs.of(information > 0.0).best(score, information)
-    expected = (400.0 * part, 2.0 * 1.2**6) if counts else (0.0, 2.0)
-    assert (found[0], found[3]) == pytest.approx(expected, rel=1e-3)

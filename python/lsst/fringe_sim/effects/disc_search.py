@@ -66,20 +66,6 @@ class Discs:
         for disc in self.transforms:
             yield irfft2(transform * disc, self.padded)[: self.shape[0], : self.shape[1]]
 
-    def best(self, score: FloatArray, information: FloatArray) -> Disc:
-        """The disc that promises most, from derivative and curvature of the likelihood in every cell."""
-        best = (0.0, 0.0, 0.0, SMALLEST_RADIUS)
-        least = 1e-6 * float(information.sum())
-        each = zip(self.radii, self.usable, self.sums(score), self.sums(information), strict=True)
-        for radius, usable, amount, variance in each:
-            strength = np.divide(
-                amount, variance, out=np.zeros(self.shape), where=usable & (variance > least)
-            )
-            # A finite signature may be scaled only a little.
-            fall = np.where((strength > 0.2) & (strength < 3.0), amount * strength, 0.0)
-            best = _better(best, fall, radius)
-        return best
-
 
 def _better(best: Disc, fall: FloatArray, radius: float) -> Disc:
     """The better of a disc and the best one of a radius about any cell."""

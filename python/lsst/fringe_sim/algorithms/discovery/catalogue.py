@@ -46,9 +46,7 @@ class Catalogue:
                 )
                 continue
             if effect.local and type(effect).propose is Effect.propose:
-                left_out[effect.name] = (
-                    "a place that no derivative leads to, and the new core has no starts for it yet"
-                )
+                left_out[effect.name] = "a place that no derivative leads to, and it proposes none"
                 continue
             items[effect.name], last = own, effect
             for number in range(2, most + 1) if effect.several else ():

@@ -45,7 +45,13 @@ class SpotScores:
         return cls(beside / inflation, information / inflation)
 
     def channel(self) -> Channel:
-        """See `spot_channel`."""
+        """Test of the strongest spot anywhere on the sensor.
+
+        What is in one place is diluted among the patterns of the whole sensor. The chance that noise has a maximum as
+        high is the mean Euler characteristic of a smooth Gaussian field [1]_, added up over the sizes.
+
+        .. [1] Worsley et al. 1996, Human Brain Mapping 4, 58
+        """
         largest = max((found[0] for found in self.maxima()), default=0.0)
         chance = sum(
             _chance_of_maximum(math.sqrt(largest), self.shape, math.sqrt(2.0) * radius)
@@ -54,7 +60,12 @@ class SpotScores:
         return Channel("spots", largest, 1.0, min(chance, 1.0))
 
     def evidence(self) -> float:
-        """See `log_evidence_of_spots`."""
+        """What a few spots would bring if they were in the model: log evidence over that of a fit without them.
+
+        They are added one by one where they bring most, fitted together, and place, size and depth of each integrated
+        by the Laplace approximation: equal chances for every place, for the logarithm of the size and for that of the
+        depth.
+        """
         spots: FloatArray = np.zeros((0, 4))
         best = 0.0
         for _ in range(MOST_SPOTS):

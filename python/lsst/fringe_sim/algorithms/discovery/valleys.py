@@ -14,7 +14,7 @@ from ..inference import Coordinate, Hypothesis, Point, free_columns, jumped, sol
 REACH, STEPS, REFITTED = 12, 5, 4
 """Repeats on both sides that are looked at, places in each, and how many of them are fitted at most."""
 
-WALKED = 8  # Valleys on each side of a fit that are followed at most, as in the present search
+WALKED = 8  # Valleys on each side of a fit that are followed at most
 
 
 def in_deepest_valleys(found: Hypothesis, fitted: Callable[[Point], Hypothesis]) -> Hypothesis:
