@@ -402,3 +402,11 @@ def test_a_cell_in_a_false_minimum_goes_where_its_neighbours_are(rng: np.random.
     assert np.abs(orders_off(in_whole_orders(point, 5.0))).max() < 0.05
     known = replace(point, problem=replace(point.problem, known=True))
     assert in_whole_orders(known, 5.0) is known
+
+
+@pytest.mark.parametrize(("exposures", "known", "left"), [(1, True, 99), (3, True, 197), (3, False, 97)])
+def test_what_one_exposure_leaves_is_free(exposures: int, known: bool, left: int) -> None:
+    """Its response cannot be told from its noise, so that a single frame of the sky tells of effects."""
+    forward, thickness = forward_of(side=10)
+    data = Data(np.ones((exposures, 100)), np.ones((exposures, 100)))
+    assert Problem(data, forward, thickness, 1e-3, known=known).freedom == left

@@ -68,9 +68,9 @@ class Problem:
 
     @property
     def freedom(self) -> int:
-        """Values beyond what cells and levels have for themselves; a response, and a thickness that is not known."""
-        own = (1 if self.known else 2) * int(self.data.seen.sum())
-        return int(np.count_nonzero(self.data.weight)) - own - self.free_levels
+        """Values beyond what cells and levels have: a response of several exposures, and a thickness not known."""
+        own = int(len(self.data.weight) > 1) + int(not self.known)
+        return int(np.count_nonzero(self.data.weight)) - own * int(self.data.seen.sum()) - self.free_levels
 
     def at(self, settings: Mapping[str, float], levels: FloatArray, thickness_um: FloatArray) -> Point:
         """The likelihood linearised about effects, levels ``(W,)`` and thickness ``(N,)``."""
