@@ -13,9 +13,8 @@ from lsst.fringe_sim.algorithms.discovery.catalogue import Catalogue
 from lsst.fringe_sim.algorithms.discovery.cells import CellData, bin_cube, finest_useful_cell
 from lsst.fringe_sim.algorithms.discovery.channels import Channel, State, chance_beyond, echo_channel
 from lsst.fringe_sim.algorithms.discovery.critics import CRITICS, Judged, _undescribed, state_of
-from lsst.fringe_sim.algorithms.discovery.lesson import data_of
 from lsst.fringe_sim.algorithms.discovery.mending import _mend_patches, mended
-from lsst.fringe_sim.algorithms.discovery.preparation import in_shape, prepare, prepare_again
+from lsst.fringe_sim.algorithms.discovery.preparation import data_of, in_shape, prepare, prepare_again
 from lsst.fringe_sim.algorithms.discovery.set_search import SetSearch
 from lsst.fringe_sim.algorithms.discovery.start import (
     SEARCH_STEP_UM,

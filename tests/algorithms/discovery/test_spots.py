@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from lsst.fringe_sim.algorithms.discovery import discover
 from lsst.fringe_sim.algorithms.discovery.cells import bin_cube
 from lsst.fringe_sim.algorithms.discovery.critics import spot_scores
-from lsst.fringe_sim.algorithms.discovery.lesson import data_of
+from lsst.fringe_sim.algorithms.discovery.preparation import data_of
 from lsst.fringe_sim.algorithms.discovery.spots import DEPTHS, RADII, SpotScores
 from lsst.fringe_sim.algorithms.inference import CellShape, Data, Forward, Hypothesis, Problem, fit
 from lsst.fringe_sim.challenge.sealed_cases import SealedCase, draw_case

@@ -13,14 +13,13 @@ from ..inference import CellShape, Data, Hypothesis, Point, fit, relaxed
 from .learning import SIZES, Prior
 from .lesson import (
     CellPart,
-    data_of,
     in_all_cells,
     in_own_cells,
     together,
     unseen_too,
     with_corrections,
 )
-from .preparation import Prepared
+from .preparation import Prepared, data_of
 from .telling import rms_left
 from .verdict_words import LEARNED_WORDS
 

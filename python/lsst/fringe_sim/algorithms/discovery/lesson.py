@@ -10,7 +10,7 @@ from scipy.ndimage import distance_transform_edt
 
 from ...array_types import BoolArray, FloatArray
 from ...effects import ImageGeometry
-from ..inference import Data, Hypothesis, Point, Problem, fit, in_best_orders, relaxed
+from ..inference import Hypothesis, Point, Problem, fit, in_best_orders, relaxed
 from .cells import CellData
 from .channels import State
 from .columns import Columns, PlaneColumns, Projected
@@ -18,7 +18,7 @@ from .continuation import filled
 from .learned_columns import with_learned
 from .learning import Part, judging_cells
 from .outliers import spoiled_cells
-from .preparation import Prepared, in_shape
+from .preparation import Prepared, data_of, in_shape
 
 
 def with_corrections(point: Point) -> Point:
@@ -226,11 +226,6 @@ def in_all_data(prepared: Prepared, found: Hypothesis) -> tuple[Hypothesis, Hypo
 def _point_of(part: Part) -> Point:
     assert isinstance(part, CellPart)
     return part.point
-
-
-def data_of(cells: CellData) -> Data:
-    """Values and weights of cells."""
-    return Data(cells.value.reshape(cells.shape[0], -1), cells.weight.reshape(cells.shape[0], -1))
 
 
 def unseen_too(prepared: Prepared, point: Point, cells: CellData) -> Point:

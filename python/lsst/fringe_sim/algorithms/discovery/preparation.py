@@ -293,7 +293,7 @@ def _judged(cells: CellData, point: Point, options: SearchOptions) -> tuple[Cell
     """Cells with the noise that a fit leaves, its measured over stated deviation, and the problem about the fit."""
     expected = (point.levels[:, np.newaxis] * point.value).reshape(cells.shape)
     cells = cells.with_noise_of(expected)
-    point = with_error_of_map(point.problem_with(_data(cells)), cells)
+    point = with_error_of_map(point.problem_with(data_of(cells)), cells)
     noise, scatter = measured_noise(point, cells.shape)
     cells = cells.scaled_noise(noise, scatter)
     old, (thickness, shape) = point.problem.forward, in_shape(point, cells)
@@ -305,7 +305,7 @@ def _judged(cells: CellData, point: Point, options: SearchOptions) -> tuple[Cell
     forward = replace(old, shape=shape, geometry=geometry)
     problem = replace(
         point.problem.about(thickness.ravel()),
-        data=_data(cells),
+        data=data_of(cells),
         forward=forward,
         response_sigma=max(scatter, NO_SCATTER),
     )
@@ -339,7 +339,8 @@ def _whole(point: Point, cells: CellData) -> FloatArray:
     return continued(in_order_of_neighbours(field, cells.seen, order_um), cells.seen)
 
 
-def _data(cells: CellData) -> Data:
+def data_of(cells: CellData) -> Data:
+    """Values and weights of cells."""
     return Data(cells.value.reshape(cells.shape[0], -1), cells.weight.reshape(cells.shape[0], -1))
 
 
@@ -367,7 +368,7 @@ def _problem(
     )
     shapes = np.ones((cells.shape[0], 1)) if few else None
     return Problem(
-        _data(cells), forward, thickness_um.ravel(), FIRST_SCATTER, level_shapes=shapes, orders=orders
+        data_of(cells), forward, thickness_um.ravel(), FIRST_SCATTER, level_shapes=shapes, orders=orders
     )
 
 

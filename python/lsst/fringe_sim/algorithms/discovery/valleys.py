@@ -53,7 +53,8 @@ def over_valleys(found: Hypothesis, fitted: Callable[[Point], Hypothesis], behin
                 last = new
                 if found.log_evidence - new.log_evidence > behind:
                     break
-    share = np.exp([one.log_evidence - max(each.log_evidence for each in every) for one in every])
+    evidence = np.array([one.log_evidence for one in every])
+    share = np.exp(evidence - evidence.max())
     away = np.array([one.values - found.values for one in every])
     spread = np.einsum("v,vi,vj->ij", share, away, away) / share.sum()
     return replace(found, covariance=found.covariance + spread)
